@@ -33,7 +33,6 @@ from .selection._agreement import RecordAgreement as RecordAgreement
 from .selection._agreement import agreement as agreement
 from .selection._compare import Candidate as Candidate
 from .selection._compare import compare as compare
-from .selection._compare import compare_laws as compare_laws
 from .selection._comparison import Comparison as Comparison
 from .selection._evaluation import Score as Score
 from .selection._evaluation import evaluate_on as evaluate_on

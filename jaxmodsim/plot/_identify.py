@@ -315,7 +315,7 @@ def comparison_figure(comparison: Comparison, *, unit: str = "m", caption: str =
 
     **Arguments:**
 
-    - `comparison`: from `compare` or `compare_laws`.
+    - `comparison`: from `compare`.
     - `unit`: unit of the errors; "1" for several channels, whose errors are in noise levels.
     - `caption`: line below the figure, such as the source of the records.
 

@@ -9,7 +9,7 @@ import pytest
 
 import jaxmodsim as jms
 from jaxmodsim import plot
-from jaxmodsim.identify import Candidate, Comparison, Continuation, compare, compare_laws, law_force, replay
+from jaxmodsim.identify import Candidate, Comparison, Continuation, compare, law_force, replay
 from jaxmodsim.identify.data._record import cut, runs_of
 from jaxmodsim.identify.selection._compare import _blocks
 from jaxmodsim.identify.uncertainty._residual_tests import correlation_time
@@ -158,12 +158,31 @@ def test_laws_are_compared_by_blocks_that_were_held_out():
     record = jms.Record(t, force + 2e-3 * np.random.default_rng(4).standard_normal(t.size), {"x": x})
     numbers = {"sigma0": 5e3, "sigma1": 1.0, "sigma2": 1.0, "Fc": 0.3, "Fs": 0.35, "vs": 1e-3}
     laws = {"Dahl": jms.Dahl(5e3, 0.3), "LuGre": Candidate(jms.LuGre(**numbers), None)}
-    found = compare_laws(laws, record, folds=3)
+    found = compare(laws, record, folds=3)
     assert found.simplest == "Dahl"
     by_name = {each.name: each for each in found.ranked}
     assert by_name["Dahl"].held_out == pytest.approx(2e-3, rel=0.07)
     assert by_name["Dahl"].start_fitted is None  # a law by itself starts unloaded
     assert by_name["LuGre"].undetermined  # its Stribeck effect, of which there is nothing in the record
+
+
+@pytest.mark.parametrize(
+    ("models", "options", "text"),
+    [
+        ({"Dahl": jms.Dahl(5e3, 0.3)}, {"q0": jnp.zeros(2)}, "Dahl is a friction law, but q0 is for"),
+        ({"Dahl": jms.Dahl(5e3, 0.3)}, {"hold_out": _record(0, 1.0)}, "but hold_out is for scenes"),
+        ({"Dahl": jms.Dahl(5e3, 0.3)}, {"substeps": 2, "observe": lambda q, qd: q}, "but observe is for scenes"),
+        ({"Dahl": jms.Dahl(5e3, 0.3), **candidates()}, {}, "Dahl is a friction law, but viscous is none"),
+        (
+            {"viscous": Candidate(scene(jms.Viscous(2.0)), None)},
+            {},
+            "viscous: compare needs a friction law, or a scene",
+        ),
+    ],
+)
+def test_laws_are_compared_with_laws(models, options, text):
+    with pytest.raises(ValueError, match=text):
+        compare(models, _record(0, 1.0), **options)
 
 
 def test_blocks_cover_every_sample_once():

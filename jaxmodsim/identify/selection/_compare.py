@@ -1,4 +1,4 @@
-"""`compare`, `compare_laws`: several models fitted to the same records and ranked by held-out error."""
+"""`compare`: several models fitted to the same records and ranked by held-out error."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -43,8 +43,8 @@ class Candidate:
 
     **Arguments:**
 
-    - `scene`: with start values; for `compare_laws` a law.
-    - `free`: names of the numbers to fit, as for `fit`; for a law None for the default of `fit_law`.
+    - `scene`: a scene or a friction law, with start values.
+    - `free`: names of the numbers to fit, as for `fit`; for a law those of `fit_law`, None for its default.
     - `description`: for tables.
     """
 
@@ -77,7 +77,7 @@ class CompareOptions:
 
 
 def compare(
-    candidates: Mapping[str, Candidate],
+    candidates: Mapping[str, Candidate | AbstractLaw],
     records: Record | Sequence[Record],
     *,
     folds: int = 4,
@@ -101,13 +101,16 @@ def compare(
     information. The states of friction laws at the start of a window are those of the fit to whole records. With
     `hold_out` the model is fitted to `records`, and run over the whole of each held-out record in the same way.
 
+    Friction laws are fitted to a measured force under a measured motion, as by `fit_law`. They run through whole
+    records, from rest and unloaded, but the samples of the held-out window do not count in the fit.
+
     Models are fitted in the order of their numbers of parameters. Each starts also from the end of the largest earlier
     one whose parameters, by the last part of their names, it has all, so that it does not fit worse than its part.
 
     **Arguments:**
 
-    - `candidates`: the models by name.
-    - `records`: a record or several, as for `fit`.
+    - `candidates`: the models by name, all of scenes or all of laws; a law alone is `Candidate(law, None)`.
+    - `records`: a record or several, as for `fit` or `fit_law`.
     - `folds`: windows of each record, >= 2; of a record in `hold_out` the parts from which the standard error comes.
     - `hold_out`: records that are only used for the held-out error; `records` are then not cut.
     - `observe`, `q0`, `qd0`, `loss`, `substeps`, `max_steps`: see `fit`.
@@ -117,14 +120,16 @@ def compare(
       the held-out fold (None: the fit to everything), the iteration and the RMSE. Ctrl-C ends the comparison with the
       finished models.
 
+    Laws use `folds`, `loss`, `initializer`, `max_steps` and `progress` alone.
+
     **Returns:**
 
     A `Comparison`. A model whose fit fails stays in it with the reason.
 
     **Raises:**
 
-    - `ValueError` for fewer than two folds, parts that are too short, no candidates, limits that no candidate has, and
-      as `fit` does.
+    - `ValueError` for fewer than two folds, parts that are too short, no candidates, laws beside scenes, laws with an
+      argument for scenes, limits that no candidate has, and as `fit` does.
     """
     options = CompareOptions(
         records=(records,) if isinstance(records, Record) else tuple(records),
@@ -134,82 +139,38 @@ def compare(
         initializers=as_initializers(initializer),
         max_steps=as_whole(max_steps, name="max_steps"),
     )
+    models = {name: x if isinstance(x, Candidate) else Candidate(x, None) for name, x in candidates.items()}
+    laws = [name for name, each in models.items() if isinstance(each.scene, AbstractLaw)]
+    if laws:
+        for_scenes = {"hold_out": options.hold_out or None, "q0": q0, "qd0": qd0, "limits": limits}
+        for_scenes |= {"observe": None if observe is first_coordinate else observe}
+        for_scenes |= {"substeps": None if options.fit.substeps == 1 else substeps}
+        if given := [name for name, value in for_scenes.items() if value is not None]:
+            raise ValueError(f"{laws[0]} is a friction law, but {given[0]} is for scenes: leave it out.")
+        if others := [name for name in models if name not in laws]:
+            raise ValueError(f"{laws[0]} is a friction law, but {others[0]} is none: compare laws or scenes, not both.")
+    else:
+        _check_scenes(models, options)
+    sizes = {name: len(ranges_of(each.scene) if laws else each.free or ()) for name, each in models.items()}
+    by = ", ".join(record.name for record in options.hold_out) or f"{options.folds} folds"
+    judge = partial(_validate_law if laws else _validate_scene, options)
+    return _compared(models, sizes, judge, by, progress, new_records=bool(options.hold_out))
+
+
+def _check_scenes(models: Mapping[str, Candidate], options: CompareOptions) -> None:
+    """Refuse wrong names before the first model has taken its time."""
     known = set()
-    for name, candidate in candidates.items():
+    for name, candidate in models.items():
         scene = candidate.scene
         if not isinstance(scene, Scene) or candidate.free is None:
-            raise ValueError(
-                f"{name}: compare needs a scene and the names of its free numbers; for laws, compare_laws."
-            )
+            raise ValueError(f"{name}: compare needs a friction law, or a scene and the names of its free numbers.")
         known |= _names(scene, options.records)
-        # Refuse wrong names before the first model has taken its time.
         base = prepare(scene, options.records, candidate.free, options.fit_of(scene)).problem.base
         check_lengths(options.hold_out or options.windows, 0 if base is None else base.q.shape[1] + base.qd.shape[1])
     unknown = [name for name in options.fit.limits if _limited(name) not in known]
     unknown += [each.name for each in options.initializers if isinstance(each, Continuation) and each.name not in known]
     if unknown:
         raise ValueError(f"{unknown[0]} is no number of any candidate; there are: {', '.join(sorted(known))}.")
-    sizes = {name: len(candidate.free or ()) for name, candidate in candidates.items()}
-    by = ", ".join(record.name for record in options.hold_out) or f"{options.folds} folds"
-    judge = partial(_validate_scene, options)
-    return _compared(candidates, sizes, judge, by, progress, new_records=bool(options.hold_out))
-
-
-def compare_laws(
-    laws: Mapping[str, AbstractLaw | Candidate],
-    records: Record | Sequence[Record],
-    *,
-    folds: int = 4,
-    loss: AbstractLoss | None = None,
-    initializer: AbstractInitializer | Sequence[AbstractInitializer] = (),
-    max_steps: int = 400,
-    progress: bool | CompareProgress = False,
-) -> Comparison:
-    """Fit several friction laws to a measured force under a measured motion, and rank them by held-out error.
-
-    Each record is cut into `folds` blocks in time. In turn one is held out: the law runs through the whole record,
-    from rest and unloaded, but the samples of the block do not count in the fit.
-
-    **Arguments:**
-
-    - `laws`: the laws by name, with start values; `Candidate(law, free)` says which of its parameters are free.
-    - `records`, `loss`, `initializer`, `max_steps`: see `fit_law`.
-    - `folds`: blocks of each record, >= 2.
-    - `progress`: see `compare`.
-
-    **Returns:**
-
-    A `Comparison`.
-
-    **Raises:**
-
-    - `ValueError` for fewer than two folds, no laws, and as `fit_law` does.
-    """
-    folds = as_whole(folds, name="folds", least=2)
-    candidates = {name: x if isinstance(x, Candidate) else Candidate(x, None) for name, x in laws.items()}
-    own = as_initializers(initializer)
-
-    def judge(
-        name: str, candidate: Candidate, report: CompareProgress | None, judged: Mapping[str, CrossValidated]
-    ) -> CrossValidated:
-        law = candidate.scene
-        if not isinstance(law, AbstractLaw):
-            raise ValueError(f"{name}: compare_laws needs friction laws; for scenes, compare.")
-        initializers = (*own, *_from_smaller(tuple(ranges_of(law)), judged))
-        told = _progress_of(report, name, None) or False
-        result = fit_law(
-            law, records, candidate.free, loss=loss, initializer=initializers, max_steps=max_steps, progress=told
-        )
-        search = _finished(result.search)
-        problem, held = search.problem, []
-        block = _blocks(problem.runs, folds)
-        for fold in range(folds):
-            options = SearchOptions(_ENOUGH, max_steps, _progress_of(report, name, fold))
-            held += _held_out(problem, search.state.x, result, block == fold, block, options)[0]
-        return CrossValidated(result, tuple(held), ())
-
-    sizes = {name: len(ranges_of(candidate.scene)) for name, candidate in candidates.items()}
-    return _compared(candidates, sizes, judge, f"{folds} folds", progress, new_records=False)
 
 
 def _limited(name: str) -> str:
@@ -282,6 +243,31 @@ def _finished(search: SearchResult | None) -> SearchResult:
     if not np.isfinite(float(search.state.cost)):
         raise RuntimeError("The fit ended with values that are not finite.")
     return search
+
+
+def _validate_law(
+    options: CompareOptions,
+    name: str,
+    candidate: Candidate,
+    report: CompareProgress | None,
+    judged: Mapping[str, CrossValidated],
+) -> CrossValidated:
+    """The fit to everything, then the residuals of each held-out block in a fit without it."""
+    law, folds = candidate.scene, options.folds
+    assert isinstance(law, AbstractLaw)
+    initializers = (*options.initializers, *_from_smaller(tuple(ranges_of(law)), judged))
+    told = _progress_of(report, name, None) or False
+    result = fit_law(
+        law, options.records, candidate.free, loss=options.fit.loss, initializer=initializers,
+        max_steps=options.max_steps, progress=told,
+    )  # fmt: skip
+    search = _finished(result.search)
+    problem, held = search.problem, []
+    block = _blocks(problem.runs, folds)
+    for fold in range(folds):
+        asked = SearchOptions(_ENOUGH, options.max_steps, _progress_of(report, name, fold))
+        held += _held_out(problem, search.state.x, result, block == fold, block, asked)[0]
+    return CrossValidated(result, tuple(held), ())
 
 
 def _validate_scene(
