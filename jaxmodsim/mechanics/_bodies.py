@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from .._core.arguments import as_label
 from .._core.arrays import PerDof, Scalar, is_known
 from .._core.cholesky import solve_balanced
 from .._core.functions import as_function
@@ -65,7 +66,9 @@ def _sum(*terms: Any) -> Bodies:
 
 
 def _name(term: Any) -> str:
-    name = getattr(term, "name", None) or getattr(term, "__name__", type(term).__name__)
+    if isinstance(term, PointMass | RigidBody):
+        return term.name or ("point_mass" if isinstance(term, PointMass) else "rigid_body")
+    name = getattr(term, "__name__", type(term).__name__)
     return name if name.isidentifier() else "term"
 
 
@@ -78,7 +81,7 @@ class PointMass(AbstractBody):
     m: ScalarOrFn = eqx.field(converter=partial(as_scalar_or_fn, name="point_mass m", allowed=_MASS))
     position: PositionFn = eqx.field(converter=partial(as_position_fn, name="point_mass position"))
     gravity: ScalarOrFn = eqx.field(converter=partial(as_scalar_or_fn, name="point_mass gravity", allowed=_GRAVITY))
-    name: str = eqx.field(static=True)
+    name: str | None = eqx.field(static=True, converter=partial(as_label, name="point_mass name"))
 
     def __call__(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Scalar:
         """`m v^2/2 - m g z` [J]."""
@@ -111,7 +114,7 @@ class PointMass(AbstractBody):
         return safe_norm(self.reaction(t, q, qd, params))
 
 
-def point_mass(m: Any, position: Any, gravity: Any = _ON_EARTH, name: str = "point_mass") -> PointMass:
+def point_mass(m: Any, position: Any, gravity: Any = _ON_EARTH, name: str | None = None) -> PointMass:
     """Lagrangian of a point mass whose position is a function of the coordinates.
 
     Bodies add up: `jms.point_mass(...) + jms.rigid_body(...) + spring`, with `spring(t, q, qd, params)` any Lagrangian.
@@ -121,7 +124,8 @@ def point_mass(m: Any, position: Any, gravity: Any = _ON_EARTH, name: str = "poi
     - `m`: mass [kg], > 0, or a function `m(params)`, so that several functions can share a number in `params`.
     - `position`: `position(q)` or `position(q, params)` in space [m], shape `[3]`, z upwards.
     - `gravity`: acceleration [m/s^2] along -z, or a function of `params`; by default 9.81.
-    - `name`: in a sum of bodies, the numbers of this one are `lagrangian.parts.NAME.m` and so on.
+    - `name`: in a sum of bodies, the numbers of this one are `lagrangian.parts.NAME.m` and so on; by default
+      "point_mass", and "point_mass_2" for the second.
 
     **Returns:**
 
@@ -130,8 +134,8 @@ def point_mass(m: Any, position: Any, gravity: Any = _ON_EARTH, name: str = "poi
 
     **Raises:**
 
-    - `ValueError` if an argument is neither a number nor a function, and (in the run) if `position` returns another
-      shape or uses an index out of range.
+    - `ValueError` if an argument is neither a number nor a function, for an empty `name`, and (in the run) if
+      `position` returns another shape or uses an index out of range.
 
     **Example:**
 
@@ -170,7 +174,7 @@ class RigidBody(AbstractBody):
     position: PositionFn = eqx.field(converter=partial(as_position_fn, name="rigid_body position"))
     orientation: PositionFn = eqx.field(converter=partial(as_position_fn, name="rigid_body orientation"))
     gravity: ScalarOrFn = eqx.field(converter=partial(as_scalar_or_fn, name="rigid_body gravity", allowed=_GRAVITY))
-    name: str = eqx.field(static=True)
+    name: str | None = eqx.field(static=True, converter=partial(as_label, name="rigid_body name"))
 
     def __call__(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Scalar:
         """`m v^2/2 + w I w/2 - m g z` [J]."""
@@ -189,7 +193,7 @@ class RigidBody(AbstractBody):
 
 
 def rigid_body(
-    m: Any, inertia: Any, position: Any, orientation: Any, gravity: Any = _ON_EARTH, name: str = "rigid_body"
+    m: Any, inertia: Any, position: Any, orientation: Any, gravity: Any = _ON_EARTH, name: str | None = None
 ) -> RigidBody:
     """Lagrangian of a rigid body, from the motion of its centre of mass and of a body-fixed frame.
 

@@ -245,6 +245,7 @@ def test_bodies_and_springs_add_up() -> None:
             lambda: Scene(rigid_body(1.0, jnp.ones(2), lambda q: jnp.zeros(3), lambda q: jnp.eye(3))),
             r"orientation returned the shape \(3, 3\) with an inertia of shape \(2,\)",
         ),
+        (lambda: point_mass(1.0, bowl, name=""), "point_mass name must be a text that is not empty, or None, but ''"),
         (lambda: point_mass(1.0, bowl) + 3.0, "added to a body must be a function"),
     ],
 )
