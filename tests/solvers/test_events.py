@@ -146,6 +146,33 @@ def test_a_violated_guard_that_has_to_hold_and_cannot_is_named() -> None:
     assert run.result == dfx.RESULTS.dt_min_reached
 
 
+def test_an_event_within_rounding_of_the_start_fires_once() -> None:
+    """A guard that is known to the rounding of 10, and falls through zero sooner than float32 resolves at t1."""
+    real, eps = jnp.float32, float(jnp.finfo(jnp.float32).eps)
+    zero, one = jnp.zeros((), real), jnp.ones((), real)
+    events = EventSolver(
+        dfx.Tsit5(), lambda t, s, args: 10.0 + s.y - 10.0, lambda t, s, args, fired: s._replace(mode=s.mode + fired),
+        dtmin=eps, max_events=4,
+    )  # fmt: skip
+    control = EventController(dfx.PIDController(1e-5, 1e-7, dtmin=eps, force_dtmin=False))
+
+    @jax.jit
+    @jax.vmap
+    def run(y0: Any, rate: Any) -> Any:
+        start = events.start(zero, y0[None], zero[None])
+        field = dfx.ODETerm(lambda t, s, args: s.rate(jnp.where(s.mode > 0, zero, -rate)))
+        how: dict[str, Any] = {"stepsize_controller": control, "throw": False}
+        done: Any = dfx.diffeqsolve(field, events, zero, one, 1e-3 * one, start, **how)
+        return done.result == dfx.RESULTS.successful, done.ys.events[-1], done.ys.log.t[-1, 0]
+
+    rng = np.random.default_rng(0)
+    y0, rate = 10.0 * eps * rng.uniform(0.0, 9.0, 128), 10.0 ** rng.uniform(-1.0, 6.0, 128)
+    successful, count, t = run(jnp.asarray(y0, real), jnp.asarray(rate, real))
+    assert np.all(successful)
+    np.testing.assert_array_equal(count, 1.0)
+    np.testing.assert_allclose(t * rate, y0, atol=10.0 * eps)
+
+
 def test_a_guard_that_starts_at_zero_and_rises_fires_when_it_comes_down() -> None:
     run = solve(fall, floor, bounce, jnp.array([0.0, 3.0]), 1.0)
     np.testing.assert_allclose(run.ys.log.t[0, 0], 2 * 3.0 / G, rtol=1e-12)
