@@ -158,8 +158,9 @@ class EventController(AbstractControllerWrapper):
         landed = landed & accept
 
         dtmin = getattr(self.controller, "dtmin", None)
-        resolution = jnp.maximum(float(jnp.finfo(length.dtype).eps) * jnp.abs(t0), 0.0 if dtmin is None else dtmin)
-        shortest = jnp.maximum(4.0 * resolution, _SHORTEST * length)
+        resolution = 4.0 * float(jnp.finfo(length.dtype).eps) * jnp.abs(t0)
+        resolution = resolution if dtmin is None else jnp.maximum(resolution, dtmin)
+        shortest = jnp.maximum(resolution, _SHORTEST * length)
         unlimited = proposed > _UNLIMITED * length
         usual = jnp.where(accept & ~unlimited, proposed, old.usual)
         step = jnp.minimum(proposed, jnp.clip(_SHRINK * factor, _SMALLEST, _LARGEST) * length)

@@ -130,7 +130,7 @@ class EventSolver(AbstractSolverWrapper):
     - `enforce`: whether the guards are conditions that have to hold, instead of crossings.
     - `samples`: a `SampledJumps` if `args` hold sampled values.
     - `rtol`: the part of its largest magnitude in a step by which a guard may fall below zero, and return, undetected.
-    - `dtmin`: that of the controller, which ends the run at shorter steps. Events are located to four of it, or to four
+    - `dtmin`: that of the controller, which ends the run at shorter steps. Events are located to it, or to four
       rounding units of time.
     - `event_mode`: `event_mode(mode)` -> the part of the mode that an event changes. A reset that changes only other
       parts, such as the choice of coordinates, is no event. By default all of it.
@@ -269,7 +269,7 @@ class EventSolver(AbstractSolverWrapper):
         length = _constant(t1 - t0)
         unit = opaque_one(length)
         eps = float(jnp.finfo(length.dtype).eps)
-        resolution = 4.0 * jnp.maximum(eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1)), _constant(jnp.asarray(self.dtmin)))
+        resolution = jnp.maximum(4.0 * eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1)), _constant(jnp.asarray(self.dtmin)))
         seen, end, root = self._look(path, (t0, t1), y0._replace(y=y1), memory, args, resolution)
         # At rest steps grow without limit, and their length says nothing about the motion after the event.
         measure = jnp.minimum(length, _GROW * memory.pace)
