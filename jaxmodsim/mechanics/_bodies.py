@@ -59,7 +59,8 @@ def _sum(*terms: Any) -> Bodies:
     """The sum; of terms with one name, the second is called `name_2`."""
     parts: dict[str, Callable[..., Any]] = {}
     for term in terms:
-        for name, part in term.parts.items() if isinstance(term, Bodies) else [(_name(term), _term(term))]:
+        added = as_function(term, name="The term added to a body")
+        for name, part in added.parts.items() if isinstance(added, Bodies) else [(_name(term), added)]:
             names = (name, *(f"{name}_{i}" for i in range(2, len(parts) + 2)))
             parts[next(each for each in names if each not in parts)] = part
     return Bodies(parts)
@@ -70,9 +71,6 @@ def _name(term: Any) -> str:
         return term.name or ("point_mass" if isinstance(term, PointMass) else "rigid_body")
     name = getattr(term, "__name__", type(term).__name__)
     return name if name.isidentifier() else "term"
-
-
-_term = partial(as_function, name="The term added to a body")
 
 
 class PointMass(AbstractBody):

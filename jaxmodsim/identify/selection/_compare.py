@@ -142,10 +142,11 @@ def compare(
     models = {name: x if isinstance(x, Candidate) else Candidate(x, None) for name, x in candidates.items()}
     laws = [name for name, each in models.items() if isinstance(each.scene, AbstractLaw)]
     if laws:
-        for_scenes = {"hold_out": options.hold_out or None, "q0": q0, "qd0": qd0, "limits": limits}
-        for_scenes |= {"observe": None if observe is first_coordinate else observe}
-        for_scenes |= {"substeps": None if options.fit.substeps == 1 else substeps}
-        if given := [name for name, value in for_scenes.items() if value is not None]:
+        for_scenes = {
+            "hold_out": bool(options.hold_out), "observe": observe is not first_coordinate, "q0": q0 is not None,
+            "qd0": qd0 is not None, "limits": limits is not None, "substeps": options.fit.substeps != 1,
+        }  # fmt: skip
+        if given := [name for name, is_given in for_scenes.items() if is_given]:
             raise ValueError(f"{laws[0]} is a friction law, but {given[0]} is for scenes: leave it out.")
         if others := [name for name in models if name not in laws]:
             raise ValueError(f"{laws[0]} is a friction law, but {others[0]} is none: compare laws or scenes, not both.")
