@@ -197,7 +197,10 @@ class RunFunctions(eqx.Module):
         after = self.system.replace(t, s.y, state, scene)
         if scene.contacts:  # a contact may have closed; the derivative, too, or the next step would move it
             after = self.project(t, after, scene, mode)
-        changed = jnp.any(mode != s.mode) | jnp.any(state.qd != before.qd)
+        # Without an impact or another mode only rounding has changed: a sample of an input in stick is no event.
+        changed = jnp.any(mode != s.mode)
+        if scene.contacts:
+            changed |= jnp.any(scene.split_modes(fired)[1]) & jnp.any(state.qd != before.qd)
         return s._replace(y=jtu.tree_map(lambda a, b: jnp.where(changed, a, b), after, s.y), mode=mode)
 
     def event_mode(self, mode: Array) -> Array:

@@ -16,22 +16,26 @@ _STRETCH = 1e-6
 
 
 class FiniteSteps(dfx.AbstractStepSizeController):
-    """Constant steps that end the run at its last finite state, instead of NaN to the end.
+    """Given steps that end the run at its last finite state, instead of NaN to the end.
 
     After a step that an event or a sample has shortened, the next step covers the rest of it.
     """
 
-    inner: dfx.ConstantStepSize = dfx.ConstantStepSize()
+    inner: dfx.ConstantStepSize | dfx.StepTo = dfx.ConstantStepSize()
+
+    @classmethod
+    def instead(cls, controller: dfx.AbstractStepSizeController) -> dfx.AbstractStepSizeController:
+        """These steps instead of those of diffrax, which are longer after a step that was shortened."""
+        return cls(controller) if isinstance(controller, dfx.ConstantStepSize | dfx.StepTo) else controller
 
     def wrap(self, direction: Real) -> "FiniteSteps":
-        """Constant steps have no direction."""
-        del direction
-        return self
+        """Wrap the controller inside."""
+        return FiniteSteps(self.inner.wrap(direction))
 
     def init(
         self, terms: PyTree, t0: Real, t1: Real, y0: PyTree, dt0: Real | None, args: PyTree, func: Fn, error_order: Any
     ) -> tuple[Real, PyTree]:
-        """As `diffrax.ConstantStepSize`."""
+        """As the controller inside."""
         end, state = self.inner.init(terms, t0, t1, y0, dt0, args, func, error_order)
         return end, (state, end)
 
@@ -52,13 +56,11 @@ class FiniteSteps(dfx.AbstractStepSizeController):
             t0, t1, y0, y1_candidate, args, y_error, error_order, old
         )
         shorter = target - t1 > _STRETCH * (target - t0)
-        next_t1 = jnp.where(shorter, target, next_t1)
-        state = jtu.tree_map(lambda a, b: jnp.where(shorter, a, b), old, new), next_t1
+        state = jtu.tree_map(lambda a, b: jnp.where(shorter, a, b), controller_state, (new, next_t1))
         finite = jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jtu.tree_leaves(y1_candidate)]).all()
         # diffrax has no code for a value that is not finite; this is the nearest code that step control does not use.
-        failure = cast(dfx.RESULTS, dfx.RESULTS.nonlinear_divergence)
-        result = dfx.RESULTS.where(finite, dfx.RESULTS.successful, failure)
-        return finite, jnp.where(finite, next_t0, t0), next_t1, jump, state, result
+        result = dfx.RESULTS.where(finite, dfx.RESULTS.successful, cast(dfx.RESULTS, dfx.RESULTS.nonlinear_divergence))
+        return finite, jnp.where(finite, next_t0, t0), state[1], jump, state, result
 
 
 def end_at(times: Float[Array, " n"], t0: Real, t1: Real, stretch: Real = True) -> Array:
@@ -91,7 +93,7 @@ class StepsTo(AbstractControllerWrapper):
     times: Float[Array, " n"]
 
     def __init__(self, controller: dfx.AbstractStepSizeController, times: Float[Array, " n"]):
-        self.controller = controller
+        self.controller = FiniteSteps.instead(controller)
         self.times = times
 
     def wrap(self, direction: Real) -> "StepsTo":

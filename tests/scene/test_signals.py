@@ -59,6 +59,32 @@ def test_stick_breaks_at_the_sample() -> None:
     np.testing.assert_allclose(energy.balance, 0.0, atol=1e-12)
 
 
+def coupled(t: Any, q: Any, qd: Any, p: Any) -> Any:
+    """A pushed mass, a spring, a mass that sticks, and a load."""
+    kinetic = 0.5 * (2.0 * qd[0] ** 2 + 3.0 * qd[1] ** 2 + 1.3 * qd[2] ** 2)
+    return kinetic - 0.5 * 400.0 * (q[0] - q[1]) ** 2 - 1.3 * 9.81 * q[2]
+
+
+@pytest.mark.parametrize(
+    ("along", "constraints"),
+    [
+        (lambda q: q[1] - 0.3 * q[0], ()),
+        (lambda q: jnp.array([q[1] - 0.3 * q[0], q[0] + 0.1 * q[1]]), ()),
+        (lambda q: q[1] - 0.3 * q[0], (jms.Contact(lambda t, q, p: q[2] - 0.4 * q[1] + 0.2 * q[0], name="floor"),)),
+    ],
+    ids=["row", "plane", "contact"],
+)
+def test_samples_in_stick_are_no_events(along: Any, constraints: Any) -> None:
+    """Rounding of the velocity that stick removes counted as an event: a fast input ran into `max_events`."""
+    t = np.linspace(0.0, 2.0, 201)
+    u = jms.Signal(t, 3.0 * np.random.default_rng(0).normal(size=201))
+    push = jms.AppliedForce(lambda t, q, qd, p: jnp.array([p["u"], 0.0, 0.1 * p["u"]]))
+    friction = jms.Friction(jms.Coulomb(500.0), along=along)
+    scene = jms.Scene(coupled, params={"u": u}, effects=(push, friction), constraints=constraints)
+    run = jms.simulate(scene, [0.0] * 3, [0.0] * 3, 2.0)
+    assert run.stats["num_events"] == 0
+
+
 def held(values: Any, adjoint: Any = None) -> Any:
     run = jms.simulate(box(jms.Signal(T, values)), [0.0], [0.3], 2.0, adjoint=adjoint, **EXACT)
     return jnp.stack([run.q[0, 0], run.qd[0, 0]])

@@ -98,8 +98,25 @@ def test_a_ball_bounces_with_a_fixed_step() -> None:
     how = {"controller": dfx.ConstantStepSize(), "dt0": 0.01, "solver": dfx.Midpoint()}
     solution = solve(fall, floor, bounce, jnp.array([1.0, 0.0]), 2.0, **how)
     np.testing.assert_allclose(solution.ys.log.t[0, :3], bounces(3), rtol=1e-12)
-    # Steps of 10 ms, and for each bounce one that passes it and one that ends on it.
-    assert solution.stats["num_steps"] <= 200 + 4 * 3
+    # Steps of 10 ms, and for each bounce one that passes it and two around it. Near the tops of the arcs a few steps
+    # are repeated: the dense output of the method is less exact than its steps.
+    assert 206 <= solution.stats["num_steps"] <= 220
+
+
+@pytest.mark.parametrize(
+    ("controller", "dt0"), [(dfx.ConstantStepSize(), 0.01), (dfx.StepTo(jnp.linspace(0.0, 2.0, 201)), None)]
+)
+def test_given_steps_go_on_as_given_after_an_event(controller: Any, dt0: float | None) -> None:
+    """The step after an event covers the rest: it was up to three times as long, beyond what the method may bear."""
+    events = EventSolver(dfx.Tsit5(), floor, bounce, max_events=16)
+    run = dfx.diffeqsolve(
+        dfx.ODETerm(fall), events, 0.0, 2.0, dt0, events.start(0.0, jnp.array([1.0, 0.0])),
+        stepsize_controller=EventController(controller), saveat=dfx.SaveAt(t0=True, steps=True),
+    )  # fmt: skip
+    ends = np.asarray(run.ts)[np.isfinite(run.ts)]
+    given = np.concatenate([np.linspace(0.0, 2.0, 201), bounces(3)])
+    np.testing.assert_allclose(ends, np.sort(given), rtol=0, atol=1e-12)
+    assert run.stats["num_rejected_steps"] == 3
 
 
 def test_the_log_holds_states_before_and_after() -> None:

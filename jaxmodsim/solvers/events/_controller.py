@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, PyTree
 
 from ..._core.arrays import Fn, Real, fusion_barrier, is_one_of, opaque_one
-from .._controllers import end_at
+from .._controllers import FiniteSteps, end_at
 from .._equation import check_ode
 from .._wrapper import AbstractControllerWrapper
 from ._state import ACCUMULATION, TOO_MANY, EventState
@@ -18,7 +18,7 @@ from ._state import ACCUMULATION, TOO_MANY, EventState
 # Limit of successive attempts that are rejected only because they do not resolve the guards; each is 0.2 to 0.9 times
 # as long as the one before. After that the guards count as resolved: a guard may jump.
 _MAX_DOUBTS = 12
-_SHRINK, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
+_SHRINK, _SMALLEST = 0.9, 0.2
 # The error did not limit a step if the next step may be this many times as long.
 _UNLIMITED = 5.0
 
@@ -94,7 +94,7 @@ class EventController(AbstractControllerWrapper):
         times: Float[Array, " n"] | None = None,
         direction: Any = None,
     ):
-        self.controller = controller
+        self.controller = FiniteSteps.instead(controller)
         self.times = times
         self.direction = direction
 
@@ -123,13 +123,11 @@ class EventController(AbstractControllerWrapper):
 
         first, inner = self.controller.init(terms, t0, t1, y0.y, dt0, args, inner_func, error_order)
         first = jnp.asarray(first)
-        zero = jnp.zeros_like(t0)
-        adaptive = isinstance(self.controller, dfx.AbstractAdaptiveStepSizeController)
-        usual = (_UNLIMITED if adaptive else 1.0) * (first - t0)
+        usual = (1.0 if isinstance(self.controller, FiniteSteps) else _UNLIMITED) * (first - t0)
         longest = getattr(self.controller, "dtmax", None)
         usual = usual if longest is None else jnp.minimum(usual, longest)
         first = first if self.times is None else end_at(self.times, t0, first)
-        return _constant(first), _ControllerState(inner, _constant(usual), zero)
+        return _constant(first), _ControllerState(inner, _constant(usual), jnp.zeros_like(t0))
 
     def adapt_step_size(
         self,
@@ -143,8 +141,7 @@ class EventController(AbstractControllerWrapper):
         controller_state: _ControllerState,
     ) -> tuple[Array, Array, Array, Array, _ControllerState, dfx.RESULTS]:
         """As the wrapped controller, but reject a step that passes an event or does not resolve the guards."""
-        old, seen = controller_state, y1_candidate.report
-        t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
+        old, seen, t0, t1 = controller_state, y1_candidate.report, jnp.asarray(t0), jnp.asarray(t1)
         keep, inner_t0, inner_t1, jump, inner, result = self.controller.adapt_step_size(
             t0, t1, y0.y, y1_candidate.y, args, y_error, error_order, old.inner
         )
@@ -161,9 +158,11 @@ class EventController(AbstractControllerWrapper):
         resolution = 4.0 * float(jnp.finfo(length.dtype).eps) * jnp.abs(t0)
         resolution = resolution if dtmin is None else jnp.maximum(resolution, dtmin)
         shortest = jnp.maximum(resolution, _SHORTEST * length)
-        unlimited = proposed > _UNLIMITED * length
+        given = isinstance(self.controller, FiniteSteps)
+        unlimited = (proposed > _UNLIMITED * length) & (not given)
         usual = jnp.where(accept & ~unlimited, proposed, old.usual)
-        step = jnp.minimum(proposed, jnp.clip(_SHRINK * factor, _SMALLEST, _LARGEST) * length)
+        step = jnp.minimum(proposed, jnp.maximum(_SHRINK * factor, _SMALLEST) * length)
+        step = jnp.where(doubtful, step, proposed) if given else step
         # A step with a small error still locates the event.
         near = proposed > _MILD * length
         step = jnp.where(keep, step, jnp.where(near, jnp.minimum(proposed, next_root * length), proposed))
