@@ -56,10 +56,11 @@ scene = jms.Scene(
 )
 
 # %% [markdown]
-# `project_initial_state` moves an approximate start to the nearest state that closes the loop.
+# `project_initial_state` moves an approximate start to the nearest state that closes the loop, in place and velocity.
+# The crank, coordinate 0, keeps its angle and its speed.
 
 # %%
-q0, qd0 = jms.project_initial_state(scene, [0.6, -0.2, 1.0], [12.0, 0.0, 0.0])
+q0, qd0 = jms.project_initial_state(scene, [0.6, -0.2, 1.0], [12.0, 0.0, 0.0], hold=(0,))
 run = jms.simulate(scene, q0, qd0, 3.0, ts=jnp.linspace(0.0, 3.0, 601))
 pin = run.reactions["pin"].multiplier
 print(f"{run.result} The pin bears up to {float(jnp.max(jnp.linalg.norm(pin, axis=1))):.0f} N.")

@@ -122,8 +122,8 @@ def sweep(request: SweepRequest) -> None:
 
     \[observe] has an entry for each result: "q\[0]", "qd\[0]", or the name
     of an effect for its force; or {of = "qd\[0]", take = "max", unit = "m/s"},
-    where take is end, max, min, mean, rms, peak (the largest magnitude) or ptp
-    (the largest minus the smallest value).
+    where take is end, max, min, mean, rms or ptp (the largest minus the smallest
+    value) of the saved times, or peak, the largest magnitude at any time.
     """
     _start()
     from ._sweep import run_sweep

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 from pydantic import Field
 
+from ..metrics import peak
 from ..scene import Scene
 from ..simulation import Trajectory, named_series
 from ..sweeps import latin_hypercube, sobol
@@ -150,7 +151,7 @@ class PeriodOf:
 
 @dataclass(frozen=True)
 class Reduced:
-    """A number that summarises an observable along a run.
+    """A number that summarises the values of an observable at the saved times of a run.
 
     - `of`: name of the observable; `take`: which number, as in `_ObservedTable`. Means are over time, by the
       trapezoidal rule.
@@ -167,8 +168,6 @@ class Reduced:
         if self.take in ("mean", "rms"):
             mean = jnp.trapezoid(x if self.take == "mean" else x**2, t) / (t[-1] - t[0])
             return mean if self.take == "mean" else jnp.sqrt(mean)
-        if self.take == "peak":
-            return jnp.max(jnp.abs(x))
         return {"max": jnp.max, "min": jnp.min, "ptp": jnp.ptp}[self.take](x)
 
 
@@ -242,11 +241,12 @@ def _observe(content: dict[str, object], where: str, series: bool) -> dict[str, 
         if not isinstance(entry, dict):
             raise ValueError(f"{where}: {name} must be text or a table, but {entry!r} was given.")
         table = _toml.read_table(_ObservedTable, entry, _toml.inner(where, name))
-        if table.take not in (None, "end") and not series:
+        if table.take not in (None, "end", "peak") and not series:
             raise ValueError(
                 f"{_toml.inner(where, name)}: take = {table.take!r} needs the run over time, but [run] has no ts."
             )
-        of = table.of if table.take is None else Reduced(table.of, table.take)
+        reduced = peak(table.of) if table.take == "peak" else Reduced(table.of, table.take or "")
+        of = table.of if table.take is None else reduced
         observables[name] = of if table.unit is None else (of, table.unit)
     if not observables:
         raise ValueError(f'{where}: it is empty; name an observable, as in v_end = "qd[0]".')

@@ -288,7 +288,7 @@ def solve_friction_forces(
 def _solve_loads(
     normal: Float[Array, " k"], gain: Float[Array, "k k"], pulls: Float[Array, " k"]
 ) -> tuple[Float[Array, " k"], Scalar]:
-    """Solve `n + gain load(n) = normal` with `load(n) = n` for n > 0 and `pulls n` otherwise; returns loads and margin.
+    """Loads and margin of `n + gain load(n) = normal`, where `load(n)` is `n` for n >= 0 and `pulls n` otherwise.
 
     The margin is the smallest determinant of `I + gain S` over all slopes S. The determinant is linear in each slope,
     so if it is positive at the ends of their ranges it is so in between, and then the solution is unique (J. Rohn,
@@ -296,7 +296,7 @@ def _solve_loads(
     """
     k = normal.shape[0]
     if k == 1:
-        slope = jnp.where(normal > 0, 1.0, pulls)
+        slope = jnp.where(normal >= 0, 1.0, pulls)
         load = slope * normal / (1.0 + gain[0] * slope)
         return load, jnp.minimum(1.0 + gain[0, 0], 1.0 + gain[0, 0] * pulls[0])
 
@@ -314,7 +314,7 @@ def _solve_loads(
     best = jnp.min(jnp.where(jnp.isnan(violation), jnp.inf, violation))
     slope = jnp.where(jnp.any(takes & (violation <= best)[None, :], axis=1), pulls, 1.0)
     signed = jnp.stack(factor_lu(_rows(gain, _constant(slope)), pivot=True)(list(jnp.unstack(normal))))
-    return jnp.where(signed > 0, 1.0, pulls) * signed, jnp.min(determinant)
+    return jnp.where(signed >= 0, 1.0, pulls) * signed, jnp.min(determinant)
 
 
 def _rows(gain: Float[Array, "k k"], slope: Float[Array, "k *m"]) -> list[list[Array]]:

@@ -99,7 +99,9 @@ def impact(
     after = v + jnp.sum(struck.delassus * impulse[None, :], axis=1)
     rounding = _ROUNDING * float(jnp.finfo(w.dtype).eps) * jnp.sum(jnp.abs(rows * qd[None, :]), axis=1)
     still = _constant(jnp.abs(after) <= jnp.maximum(rest, rounding))
-    stopped = still[n:] & _constant(jnp.abs(v[n:]) > jnp.maximum(rest, rounding[n:]))
+    # An element that an impact begins to load had the mode of one without load.
+    loaded = jnp.any((struck.loads > 0) & (touches & (closed == 0))[None, :], axis=1)
+    stopped = still[n:] & (loaded | _constant(jnp.abs(v[n:]) > jnp.maximum(rest, rounding[n:])))
     of_each = dict(zip(rubbing, stopped, strict=True))
     closes = touches & still[:n]
     qd = qd + jnp.sum(reach * impulse[:, None], axis=0)

@@ -24,6 +24,9 @@ _AT_REST, _IN_MOTION, _MOVES = 0.1, 150.0, 0.01
 _OF_ARRAY = 1e-3
 # Errors of a tangent that are noise: in parts of `atol`, in roundings of the state, and in roundings of the tangent.
 _OF_ATOL, _ROUNDINGS, _RESOLVED = 1e-6, 16.0, 64.0
+# At rest forces cancel up to their rounding, the only error of the state: as an error of the tangent it is at most this
+# many times as large. It is no more than this part of the tolerance of the state.
+_OF_ERROR, _OF_TOLERANCE = 8.0, 0.1
 
 
 class ProbeTangent(NamedTuple):
@@ -31,8 +34,8 @@ class ProbeTangent(NamedTuple):
 
     tangent: tuple[PyTree, PyTree]
     largest: PyTree
-    # 0 in a first step with a projection, else 1. That projection changes the tangent by a jump, which is no error and
-    # does not shrink with the step.
+    # 0 in a first step with a projection, and in one after an event, else 1. That projection changes the tangent by a
+    # jump, which is no error and does not shrink with the step.
     counts: Array
 
 
@@ -82,6 +85,7 @@ class ProbedStep(NamedTuple):
     step: PyTree
     change: PyTree
     controller: PyTree
+    projects: bool
 
     def __call__(self, t0: Array, t1: Array, y: Probed, state: PyTree, jump: Real) -> tuple[Any, ...]:
         """The step; its error estimate is a pair: that of the state, and the size of that of the probe."""
@@ -102,7 +106,10 @@ class ProbedStep(NamedTuple):
         largest = jtu.tree_map(lambda d, x: jnp.maximum(jnp.abs(d), x), _integrated(tangent[0]), probe.largest)
         ends = jtu.tree_map(lambda a, b: jnp.maximum(jnp.abs(a), jnp.abs(b)), _integrated(held), _integrated(y1))
         errors = jnp.where(probe.counts > 0, self._size(error, error_of_probe, largest, ends), 0.0)
-        after = ProbeTangent(tangent, largest, jnp.ones_like(probe.counts))
+        counts = jnp.ones_like(probe.counts)
+        if self.projects and isinstance(y1, EventState):
+            counts = jnp.where(lax.stop_gradient(y1.t) == held.t, counts, 0.0)
+        after = ProbeTangent(tangent, largest, counts)
         return Probed(y1, after), (error, errors), dense, state1, result
 
     def _size(self, error: PyTree, error_of_probe: PyTree, largest: PyTree, y: PyTree) -> Array:
@@ -111,11 +118,13 @@ class ProbedStep(NamedTuple):
         rtol, atol = lax.stop_gradient((control.rtol, control.atol))
 
         def size(of_state: Array, of_tangent: Array, largest: Array, y: Array) -> Array:
-            moves = jnp.minimum(1.0, jnp.abs(of_state) / (_MOVES * (atol + rtol * y)))
+            of_state, tolerance = jnp.abs(of_state), atol + rtol * y
+            moves = jnp.minimum(1.0, of_state / (_MOVES * tolerance))
             eps = float(jnp.finfo(y.dtype).eps)
             relative = jnp.maximum(_AT_REST * (1.0 + (_IN_MOTION - 1.0) * moves) * rtol, _RESOLVED * eps)
             tangent = jnp.maximum(largest, _OF_ARRAY * jnp.max(largest))
             noise = _OF_ATOL * atol + _ROUNDINGS * eps * y
+            noise = noise + jnp.minimum(_OF_ERROR * of_state, _OF_TOLERANCE * tolerance)
             return jnp.sqrt(jnp.mean(jnp.square(of_tangent / (relative * tangent + noise))))
 
         return jnp.max(jnp.stack(jtu.tree_leaves(jtu.tree_map(size, error, error_of_probe, largest, y))))

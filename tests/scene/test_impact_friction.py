@@ -118,6 +118,39 @@ def test_a_block_lands_with_friction_slides_and_stops():
     np.testing.assert_allclose(run.energy.balance, 0.0, atol=1e-11)
 
 
+def test_a_block_that_begins_on_the_floor():
+    """It strikes the floor at the start, rests, or slides as its load rises from zero: places and all derivatives."""
+
+    def end(force, pull, rise, vz, t1):
+        def press(t, q, qd, p):
+            return jnp.stack([p["H"], p["P"] - p["r"] * t])
+
+        friction = jms.Friction(jms.Coulomb(0.3, 0.4), along=lambda q: q[0], normal_force="floor")
+        scene = jms.Scene(
+            lambda t, q, qd, p: 0.5 * (qd[0] ** 2 + qd[1] ** 2),
+            params={"H": force, "P": pull, "r": rise},
+            effects=(jms.AppliedForce(press), friction),
+            constraints=(jms.Contact(_height, name="floor"),),
+        )
+        run = jms.simulate(scene, [1.0, 0.0], jnp.stack([0.0 * vz, vz]), t1, throw=False)
+        return run.q[-1, 0] - 1.0, (run.result.code, run.stats["num_steps"])
+
+    rests = [(3.5, 0.0), (3.5, -1e-6), (3.5, -1.0), (1.0, -1e-9), (1.0, -1e-10)]
+    sticks = [(force, -10.0, 0.0, vz, t1) for force, vz in rests for t1 in (1.0, 100.0)]
+    slides = [(0.4, 0.0, rise, 0.0, 1.0) for rise in (0.2, 0.7, 1.3)]
+    value_and_slopes = jax.jit(jax.vmap(jax.value_and_grad(end, (0, 1, 2), has_aux=True)))
+    (x, (codes, steps)), slopes = value_and_slopes(*map(jnp.array, zip(*sticks, *slides, strict=True)))
+    np.testing.assert_array_equal(codes, 0)
+    # Rounding at rest is no error: such gradients took thousands of steps.
+    assert np.max(steps) < 100
+    n = len(sticks)
+    np.testing.assert_allclose(x[:n], 0.0, atol=1e-9)
+    np.testing.assert_allclose(np.stack(slopes)[:, :n], 0.0, atol=1e-9)
+    # x = H t^2/2 - mu r t^3/6, and mu P t^2/2 more where P lifts.
+    np.testing.assert_allclose(x[n:], [0.2 - 0.05 * each[2] for each in slides], rtol=1e-9)
+    np.testing.assert_allclose(np.stack(slopes)[:, n:].T, [[0.5, 0.15, -0.05]] * 3, rtol=1e-9)
+
+
 def test_a_slow_block_stops_where_it_lands():
     run = _land(0.5, 0.5, 1.0)
     assert {change.after for change in run.mode_changes} == {"stick", "closed"}

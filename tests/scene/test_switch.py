@@ -42,6 +42,20 @@ def test_a_switching_time_has_its_second_derivative():
     assert jax.jit(jax.hessian(by_begin))(3.0) == pytest.approx(3.5, rel=1e-8)
 
 
+def test_a_switch_at_a_sample_of_an_input_has_the_derivative_of_its_own_force():
+    """The jump of the input does not move with the switch."""
+    motor = jms.Switch(lambda t, q, qd, p: p["stop"] - t, above=constant, name="motor")
+    push = jms.AppliedForce(lambda t, q, qd, p: p["u"][None])
+
+    def by_stop(stop, u):
+        params = {"m": 1.0, "F": 2.0, "stop": stop, "u": jms.Signal(jnp.array([0.0, 1.0]), u)}
+        return jms.simulate(jms.Scene(lagrangian, params=params, effects=(motor, push)), [0.0], [0.0], 2.0).q[-1, 0]
+
+    inputs = jnp.array([[4.0, 0.0], [0.0, 4.0], [3.0, 3.0]])
+    # F (2 - stop)
+    np.testing.assert_allclose(jax.jit(jax.vmap(jax.grad(by_stop), (None, 0)))(1.0, inputs), 2.0, rtol=1e-8)
+
+
 def test_a_switch_is_logged_saved_and_balanced():
     run = jms.simulate(PUSHED, [0.0], [0.0], 10.0, ts=jnp.linspace(0.0, 10.0, 11))
     (change,) = run.mode_changes

@@ -46,7 +46,7 @@ class Passage(NamedTuple):
 
     - `t`: time of the event.
     - `before`: y before the reset; the mode is that of the step.
-    - `after`: y and mode after it, and the rate of y.
+    - `after`: y and mode after it, and the rate of y at the end of the step.
     - `y`, `guards`: y at the end of the step, and the guards there.
     """
 
@@ -71,7 +71,7 @@ class _Place(NamedTuple):
 def pass_event(
     landed: Landed,
     evaluate: Callable[[Array, PyTree, PyTree, PyTree], tuple[PyTree, Float[Array, " guards"]]],
-    args: tuple[PyTree, PyTree],
+    args: tuple[PyTree, PyTree, PyTree],
     reset: Callable[[Array, PyTree], tuple[PyTree, PyTree]],
 ) -> Passage:
     """Carry a state from the end of a step to the root of a guard, reset it, and carry it back.
@@ -86,7 +86,7 @@ def pass_event(
 
     - `landed`: the end of the step.
     - `evaluate`: `evaluate(t, y, mode, args)` -> the rate of y, and the guards.
-    - `args`: arguments before and after the event.
+    - `args`: arguments before the event, on the way back, and at the end of the step.
     - `reset`: `reset(t, y)` -> y and mode after the event.
     """
     level, rate = landed.fall
@@ -98,8 +98,9 @@ def pass_event(
         begins, at_root, behind = (i == 0) | (i == _RESET), i == _ROOT, i >= _RESET
         before = y
         y, mode = jax.lax.cond(i == _RESET, lambda: reset(t, y), lambda: (y, mode))
-        origin = _choose(begins, (t, y), place.origin)
-        rates, guards = evaluate(t, y, mode, _choose(behind, args[1], args[0]))
+        origin = choose(begins, (t, y), place.origin)
+        there = choose(i == _COUNT - 1, args[2], choose(behind, args[1], args[0]))
+        rates, guards = evaluate(t, y, mode, there)
         newton = (level - jnp.sum(jnp.where(landed.first, guards, 0.0))) / rate
         # A guard that a reset has violated fires at the end of the step: it has no root here, or one before the reset.
         on_root = jnp.where(
@@ -113,7 +114,7 @@ def pass_event(
         way = jnp.where(i == 0, newton, place.way)
         whole = way + newton
         whole = jnp.where(_constant(landed.t + whole < landed.earliest), _constant(landed.earliest - landed.t), whole)
-        start, length = _choose(at_root, ((landed.t, y), newton), (origin, share * way))
+        start, length = choose(at_root, ((landed.t, y), newton), (origin, share * way))
         way = jnp.where(at_root, whole, way)
         following = _Place(
             jnp.where(i == _LAST, landed.t, start[0] + jnp.where(at_root, way, length)),
@@ -127,11 +128,11 @@ def pass_event(
 
     turns = jnp.arange(_COUNT), jnp.asarray(_SHARES, rate.dtype)
     begin = _Place(landed.t, landed.y, landed.mode, (landed.t, landed.y), jnp.zeros_like(rate), jnp.asarray(False))
-    _, (t, before, after, guards) = jax.lax.scan(onward, begin, turns)
+    _, (t, before, (y, mode, rates), guards) = jax.lax.scan(onward, begin, turns)
     at, end = (lambda tree, i=i: jtu.tree_map(lambda x: x[i], tree) for i in (_RESET, _COUNT - 1))
-    return Passage(at(t), at(before), at(after), end(after[0]), end(guards))
+    return Passage(at(t), at(before), (at(y), at(mode), end(rates)), end(y), end(guards))
 
 
-def _choose(where: Bool[Array, ""], one: PyTree, other: PyTree) -> PyTree:
+def choose(where: Bool[Array, ""], one: PyTree, other: PyTree) -> PyTree:
     """`one` or `other`, without an operation on leaves that are the same object in both."""
     return jtu.tree_map(lambda a, b: a if a is b else jnp.where(where, a, b), one, other)

@@ -14,7 +14,7 @@ from ..._core.arrays import Real, fusion_barrier, opaque_one
 from .._projected import projected
 from .._wrapper import AbstractSolverWrapper
 from ._guard_scan import GuardScan, arrives, first_root, instant, scan_guards
-from ._passage import LATITUDE, Landed, pass_event
+from ._passage import LATITUDE, Landed, choose, pass_event
 from ._policy import AbstractGuardPolicy, Conditions, Crossings
 from ._samples import SampledJumps, on_jump
 from ._state import ACCUMULATION, ONGOING, TOO_MANY, EventLog, EventMemory, EventState, Landing, StepReport, write
@@ -395,6 +395,8 @@ class EventSolver(AbstractSolverWrapper):
         (state, memory), (root, near), (args, whole), (fired, first) = at_end, places, sides, landing[:2]
         # Arguments after the event are those of the step that begins there.
         new_args = whole if self.samples is None else self.samples.freeze_args(t, whole)
+        # An event within no distance is at a jump of the samples: the way back from it is before the jump.
+        back = choose(near == 0, args, new_args)
 
         def evaluate(t: Array, y: PyTree, mode: PyTree, args: PyTree) -> tuple[PyTree, Array]:
             here = state._replace(y=y, mode=mode)
@@ -415,7 +417,7 @@ class EventSolver(AbstractSolverWrapper):
         arrives = jnp.any(first & (memory.guard > 0))
         early, level = jnp.where(arrives, 0.0, level / jnp.abs(rate)), jnp.where(arrives, level, 0.0)
         landed = Landed(t, state.y, state.mode, first, (level, rate), landing.landed, near, state.t)
-        passage = pass_event(landed, evaluate, (args, new_args), reset)
+        passage = pass_event(landed, evaluate, (args, back, new_args), reset)
         t_event, values, (y, mode, slope) = passage.t, passage.guards, passage.after
         spread, dense = _spread(t_event, state.t, memory)
         ends = dense & (not self.carries_on)
