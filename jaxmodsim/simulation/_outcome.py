@@ -17,7 +17,7 @@ from .._core.functions import depends_on
 from .._core.parameters import check_ranges, modules_of, range_checks
 from .._core.scalarise import in_scalars
 from ..friction import DeadZone, Regularized, Sign
-from ..mechanics import constraint_residual, motion_equations, quadratic
+from ..mechanics import Contact, constraint_residual, motion_equations, quadratic
 from ..scene import Scene, State, check_scene, describe_series, from_dynamics, quantity_of
 from ..solvers import ACCUMULATION, TOO_MANY
 
@@ -344,10 +344,39 @@ def _blame_mass(
     return jnp.where(jnp.any(bad) & known, FIRST_MASS + jnp.argmax(bad), code)
 
 
+def describe_start(scene: Scene, t: float, y: State, code: int) -> str:
+    """The sentence for a known initial state with a `violation_code`: worst contact or constraint, and the remedy."""
+    time = jnp.asarray(t, y.q.dtype)
+    now, state = scene.bind_time(time), f"The state at t = {t:.9g} is {_state(scene, y)}."
+    if code == PENETRATES:
+        return f"The initial state violates {_deepest(now, time, y)} Change q0 until no gap is negative. {state}"
+    found = []
+    for name, each in zip(now.constraint_names, now.constraints, strict=True):
+        if not isinstance(each, Contact):
+            distances = constraint_residual((each,), time, y.q, y.qd, now.params)
+            residuals = each.error(time, y.q, now.params), each.rate(time, y.q, y.qd, now.params)
+            for kind, distance, residual in zip(("position", "velocity"), distances, residuals, strict=True):
+                found.append((np.nan_to_num(distance, nan=np.inf), name, kind, residual))
+    _, name, kind, residual = max(found, key=lambda each: each[0])
+    largest = max(np.ravel(residual), key=abs)
+    return f"{_GENERAL[code]} The {kind} residual of {name!r} is {largest:.6g}, but zero is needed. {state}"
+
+
+def _deepest(scene: Scene, t: Array, y: State) -> str:
+    """A sentence with the contact of the smallest gap."""
+    gaps = {name: float(np.min(each.error(t, y.q, scene.params))) for name, each in scene.contacts.items()}
+    name = min(gaps, key=gaps.__getitem__)
+    return f"contact {name!r}: its gap is negative, {gaps[name]:.6g}."
+
+
 def describe_failure(scene: Scene, t: float, y: State, code: int) -> str:
     """The sentence for a failed run with known values, with time, state, and the coordinates or value in error."""
     dof = y.q.shape[0]
     text = outcome_messages(scene, dof)[code]
+    if code == PENETRATES:
+        time = jnp.asarray(t, y.q.dtype)
+        text = f"The run missed an impact at {_deepest(scene.bind_time(time), time, y)}"
+        text += " Pass smaller tolerances or dtmax, or compute in float64."
     if FIRST_MASS <= code < FIRST_MASS + dof:
         time = jnp.asarray(t, y.q.dtype)
         mass = np.asarray(_mass(scene.bind_time(time), time, y))

@@ -22,7 +22,7 @@ from .._core.speed import recommend_tuning, warn_about_compilation, warn_about_f
 from .._core.user_errors import LastLines
 from ..scene import Scene, State, vector_field
 from ..solvers import Gauss, ImplicitFriction, Rodas5P
-from ._outcome import SUCCESS, SimulationError, describe_failure, outcome_messages, violation_code
+from ._outcome import SUCCESS, SimulationError, describe_failure, describe_start, outcome_messages, violation_code
 from ._run_request import MOST_EVENTS, MOST_STEPS, RunRequest, run_request
 from ._solve import RunOutput, compiled_runs, default_solver, solve
 from ._trajectory import Trajectory, trajectory
@@ -213,7 +213,7 @@ def _check_initial_state(request: RunRequest) -> None:
         y = State(q0, qd0, {})
         code = violation_code(request.scene, t0, y)
         if is_known(code) and int(code) != SUCCESS:
-            raise SimulationError(describe_failure(request.scene, float(t0), y, int(code)))
+            raise SimulationError(describe_start(request.scene, float(t0), y, int(code)))
 
 
 def _raise_early_end(request: RunRequest, solved: RunOutput) -> RunOutput:

@@ -181,13 +181,13 @@ def test_restitution_under_friction_does_not_move_the_resting_place(derivative):
 def test_a_violated_start_is_refused_before_the_run_is_compiled():
     before = compiled_runs()
     floor = jms.Scene(_thrown, constraints=(jms.Contact(_over, name="floor"),))
-    with pytest.raises(jms.SimulationError, match="gap is negative"):
+    with pytest.raises(jms.SimulationError, match=r"contact 'floor': its gap is negative, -2e-06\. (?!.*dtmax)"):
         jms.simulate(floor, [0.0, -2e-6], [0.0, 0.0], 1.0)
     with pytest.raises(jms.SimulationError, match="gap is negative"):
         jms.simulate(_rough(0.5), jnp.array([0.0, -2e-6]), jnp.zeros(2), 1.0)
     rod = jms.Scene(_thrown, constraints=(jms.Constraint(lambda t, q, p: jnp.sum(q**2) - 1.0),))
     for q, qd in (([0.0, -1.001], [0.0, 0.0]), ([0.0, -1.0], [0.0, 0.1])):
-        with pytest.raises(jms.SimulationError, match="does not obey the constraints"):
+        with pytest.raises(jms.SimulationError, match=r"does not obey the constraints.* residual of 'constraint' is"):
             jms.simulate(rod, q, qd, 1.0)
     for q, qd, error in (
         ([0.0], [0.0, 0.0], "must both have the shape"),
