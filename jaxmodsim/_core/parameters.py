@@ -1,7 +1,7 @@
 """Numbers of a scene: their conversion, admissible ranges and error messages."""
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -125,6 +125,30 @@ def as_real(value: object, *, name: str) -> Float[Array, "..."]:
                 raise ValueError(f"{name} is too large for {dtype}.") from error
     kind = value if isinstance(value, str | bool) else getattr(value, "dtype", type(value).__name__)
     raise ValueError(f"{name} must be a real number or an array of real numbers, but {kind!r} was given.")
+
+
+def check_not_nan(leaves: Iterable[object], numbers: Callable[[], Mapping[str, Any]]) -> None:
+    """Refuse a NaN among known leaves of a scene; `numbers()` has its numbers by name.
+
+    **Raises:**
+
+    - `ValueError` with the name of the number, and the index of the entry of an array.
+    """
+    if any(map(_has_nan, leaves)):
+        for name, number in numbers().items():
+            if _has_nan(number):
+                index = np.argwhere(np.isnan(np.asarray(number)))[0].tolist()
+                raise ValueError(
+                    f"The number {f'{name}{index}' if index else name!r} of the scene is NaN, and so would be the"
+                    " results: give its value."
+                )
+
+
+def _has_nan(x: Any) -> bool:
+    if getattr(getattr(x, "dtype", None), "kind", "") != "f" or not is_known(x):
+        return isinstance(x, float) and x != x
+    value = x.item() if x.ndim == 0 else None  # for one number NumPy takes longer than Python
+    return value != value if value is not None else bool(np.isnan(np.asarray(x)).any())
 
 
 def as_vector(value: object, *, name: str) -> Float[Array, " n"]:

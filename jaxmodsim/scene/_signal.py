@@ -71,8 +71,13 @@ class Signal(eqx.Module):
         if not is_known(self.t):
             return
         t = np.asarray(self.t)
-        if not (np.isfinite(t).all() and (np.diff(t) > 0).all()):
-            raise ValueError("Signal: t must be finite and increase from sample to sample.")
+        if (bad := np.flatnonzero(~(np.isfinite(t) & (np.diff(t, prepend=-np.inf) > 0)))).size:
+            k = bad[0]
+            follows = f" after t[{k - 1}] = {t[k - 1]}" if k else ""
+            raise ValueError(
+                f"Signal: t must be finite and increase from sample to sample, but t[{k}] = {t[k]}{follows}: sort the"
+                " samples, and leave out repeated ones."
+            )
         if is_known(self.values) and (bad := np.flatnonzero(~np.isfinite(self.values))).size:
             raise ValueError(
                 f"Signal: values must be finite, but the one at t = {t[bad[0]]:g} is {self.values[bad[0]]}"

@@ -15,9 +15,9 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._core.arguments import as_flag, as_mapping, as_names, as_whole, check_real, did_you_mean
 from .._core.arrays import is_known
-from .._core.parameters import is_weak
+from .._core.parameters import check_not_nan, is_weak
 from .._core.speed import warn_about_single_precision
-from ..scene import Scene, State, check_step
+from ..scene import Scene, State, check_step, scene_numbers
 from ..solvers import ImplicitFriction
 from ._integrated_system import Series
 
@@ -204,6 +204,7 @@ def _converted(scene: Scene, given: dict[str, Any]) -> tuple[Scene, dict[str, An
         if type(value) is not float:
             check_real(value, name=name)
     leaves: list[Any] = [*jtu.tree_leaves(scene), given["q0"], given["qd0"]]
+    check_not_nan(leaves[:-2], lambda: scene_numbers(scene))
     kinds = {x.dtype for x in leaves if hasattr(x, "dtype") and not is_weak(x)}
     dtype = kinds.pop() if len(kinds) == 1 else jnp.result_type(*kinds) if kinds else jnp.result_type(float)
     if not jnp.issubdtype(dtype, jnp.floating):
@@ -214,9 +215,10 @@ def _converted(scene: Scene, given: dict[str, Any]) -> tuple[Scene, dict[str, An
     array = {name: _array(value, dtype) for name, value in given.items()}
     for name in ("q0", "qd0"):
         if array[name].ndim != 1 or array[name].shape[0] == 0 or array[name].shape != array["q0"].shape:
+            listed = f": write {name}=[{given[name]}]" if array[name].ndim == 0 else ""
             raise ValueError(
                 f"q0 and qd0 must both have the shape [dof], but q0 has the shape {array['q0'].shape} and qd0"
-                f" {array['qd0'].shape}."
+                f" {array['qd0'].shape}{listed}."
             )
     for name in ("t0", "t1", "rtol", "atol", "dt", "dtmax"):
         if name in array and array[name].shape != ():
@@ -286,8 +288,9 @@ def _check_values(array: dict[str, Any]) -> None:
         raise ValueError(f"t1 must not be before t0, but t0 = {array['t0']} and t1 = {array['t1']}.")
     if "ts" in array and (array["ts"].ndim != 1 or array["ts"].shape[0] == 0):
         raise ValueError(f"ts must be a vector of times, shape [time], but it has the shape {array['ts'].shape}.")
-    if ts is not None and (ts[1:] < ts[:-1]).any():
-        raise ValueError("ts must increase.")
+    if ts is not None and (back := ts[1:] < ts[:-1]).any():
+        k = int(np.argmax(back)) + 1
+        raise ValueError(f"ts must increase, but ts[{k}] = {ts[k]} follows ts[{k - 1}] = {ts[k - 1]}: sort the times.")
     if ts is not None and t0 is not None and t1 is not None and not (t0 <= ts[0] and ts[-1] <= t1):
         raise ValueError(
             f"ts must lie within [t0, t1] = [{array['t0']}, {array['t1']}], but runs from {ts[0]} to {ts[-1]}."

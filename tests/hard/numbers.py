@@ -52,7 +52,7 @@ def _garbage() -> list[HardCase]:
             {
                 "law": (lambda: Coulomb(_NAN), "Fc must be finite"),
                 "infinite law": (lambda: ramped_box.lugre(sigma0=_INF), "sigma0 must be finite"),
-                "put in later": (lambda: _poisoned(_NAN), "not finite"),
+                "put in later": (lambda: _poisoned(_NAN), "'k' of the scene is NaN"),
                 "infinite, put in later": (lambda: _poisoned(_INF), "not finite"),
             },
         ),

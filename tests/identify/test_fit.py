@@ -255,6 +255,11 @@ def test_inputs_that_the_scene_does_not_know_are_refused(clean):
         jms.fit(sprung(), jms.Record(t, q, {"force": u}), ("m",))
 
 
+def test_a_missing_number_is_named_before_the_search(clean):
+    with pytest.raises(ValueError, match="The number 'm' of the scene is NaN"):
+        jms.fit(replace_numbers(sprung(), {"m": jnp.asarray(jnp.nan), "u": jnp.asarray(jnp.nan)}), noisy(clean, 0), ())
+
+
 def test_too_few_samples_are_refused(clean):
     t, u, q = clean
     with pytest.raises(ValueError, match="3 samples are too few for 5 unknowns"):

@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..._core.arguments import as_float, as_mapping, as_names, as_reals, as_whole
 from ..._core.arrays import on_device
-from ..._core.parameters import Range, check_ranges, modules_of
+from ..._core.parameters import Range, check_not_nan, check_ranges, modules_of
 from ...scene import Scene, State, check_scene, scene_numbers, scene_ranges
 from ..data._record import Record, Windows, cut, runs_of, slip_channel
 from ..data._signals import start_errors, start_state
@@ -133,6 +133,8 @@ def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str
     numbers, ranges = _numbers(scene, several, options)
     single = split_entries(numbers)
     whole = scene_numbers(scene)
+    undriven = {name: x for name, x in whole.items() if name not in several[0].inputs}
+    check_not_nan(undriven.values(), lambda: undriven)
     chosen = shared if isinstance(shared, str) else chosen_entries({**whole, **numbers}, shared)
     driven = sorted(set(chosen) & set(several[0].inputs))
     if driven:
