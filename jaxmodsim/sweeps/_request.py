@@ -124,6 +124,7 @@ def _of_scene(scene: Scene, grid: Grid, observe: object, arguments: dict[str, ob
         tuple(GridAxis(a.name, {name: convert(name, x) for name, x in a.values.items()}) for a in grid.axes),
     )
     _check_runs(converted, numbers)
+    _check_ranges(scene, {name: inside[name][2] for name in swept if name in inside}, converted.values)
     # `simulate` checks the arguments of the first run, while their values are known.
     first = numbers | {name: value for name, value in converted.first.items() if name in numbers}
     run_request(scene, **first, **dict(run.choices))
@@ -154,6 +155,23 @@ def _check_runs(grid: Grid, numbers: Mapping[str, Any]) -> None:
             f"ts must lie within [t0, t1] of every run, from {t0.max():g} to {t1.min():g}, but runs from {ts[0]:g} to"
             f" {ts[-1]:g}. Observe the end of the motion, or set ts relative to t1 inside a function."
         )
+
+
+def _check_ranges(scene: Scene, leaves: Mapping[str, str], swept: Mapping[str, np.ndarray]) -> None:
+    """Refuse values out of range; the runs check limits that are arrays, or change as well. `leaves`: their arrays."""
+    numbers = scene_numbers(scene)
+    for number, allowed in scene_ranges(scene).items():
+        pair = [each for each in (number, allowed.lower) if isinstance(each, str)]
+        for name, leaf in leaves.items():
+            if leaf not in pair or any(
+                each != leaf and (each in leaves.values() or numbers[each].shape) for each in pair
+            ):
+                continue
+            now = {**numbers, leaf: swept[name]}
+            wrong = np.argwhere(~np.asarray(allowed.holds(now[number], now))).tolist()
+            if wrong:
+                value = swept[name][tuple(wrong[0])]
+                raise ValueError(f"{name!r} in over is {value:g} at {wrong[0]}, but {number} must be {allowed.text}.")
 
 
 def _inside(scene: Scene) -> dict[str, tuple[tuple[int, ...], np.dtype, str]]:
