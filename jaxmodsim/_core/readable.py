@@ -1,5 +1,6 @@
 """Objects that print as a short table, also in notebooks."""
 
+import math
 from functools import singledispatch
 from html import escape
 from typing import NamedTuple
@@ -71,3 +72,18 @@ def short(x: object) -> str:
     if array.dtype.kind not in "fiu":
         return f"shape {array.shape}"
     return f"shape {array.shape}, {array.min():.4g} to {array.max():.4g}"
+
+
+def interval_text(low: float, high: float) -> str:
+    """Both ends of an interval, to two significant digits of its half-width."""
+    half = 0.5 * (high - low)
+    if not 0 < half < math.inf:
+        return f"{low:.5g} to {high:.5g}"
+    last = math.floor(math.log10(float(f"{half:.1e}"))) - 1  # place of the last digit
+
+    def text(x: float) -> str:
+        x = round(x, -last) + 0.0  # no negative zero
+        digits = math.floor(math.log10(max(abs(x), 10.0**last))) - last + 1
+        return f"{x:#.{min(digits, 16)}g}".removesuffix(".")
+
+    return f"{text(low)} to {text(high)}"

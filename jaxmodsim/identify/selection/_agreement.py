@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..._core.arguments import as_share, as_whole
 from ..._core.arrays import on_device
-from ..._core.readable import AbstractReadable, Table, table_of
+from ..._core.readable import AbstractReadable, Table, interval_text, table_of
 from ...friction import AbstractLaw
 from ...scene import Scene, scene_numbers, scene_ranges
 from ..estimate._problem import FitProblem
@@ -98,7 +98,7 @@ def _(agreement: RecordAgreement) -> Table:
     if unknown := [name for name in agreement.names if name not in tested]:
         notes.append(f"Not every record determines {', '.join(unknown)}: not compared.")
     rows = [
-        (name, f"{x:.5g}", f"{error:.2g}", f"{between:.2g}", f"{low:.2g} to {high:.2g}", f"{p:.2g}")
+        (name, f"{x:.5g}", f"{error:.2g}", f"{between:.2g}", interval_text(low, high), f"{p:.2g}")
         for name, x, error, between, low, high, p in agreement.rows()
     ]
     head = ("parameter", "common", "standard error", "between records", "95 % interval", "p")

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..._core.arguments import as_share, as_whole
-from ..._core.readable import AbstractReadable, Table, table_of
+from ..._core.readable import AbstractReadable, Table, interval_text, table_of
 from ..._core.system import extra
 from ..estimate._problem import FitProblem
 from ..estimate._search import SearchResult
@@ -311,7 +311,7 @@ def _(posterior: Posterior) -> Table:
                 name,
                 f"{x.mean():.6g}",
                 f"{x.std():.2g}",
-                f"{low:.5g} to {high:.5g}",
+                interval_text(low, high),
                 f"{estimate.values[name]:.6g}" if fitted else "",
                 f"{estimate.errors[name]:.2g}" if fitted else "",
                 f"{posterior.rhat[name]:.3f}",

@@ -15,7 +15,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..._core.readable import AbstractReadable, Table, table_of
+from ..._core.readable import AbstractReadable, Table, interval_text, table_of
 from ..._core.system import jsonable, written_whole
 from ..data._record import Record
 from ..data._signals import resolution, sample_noise
@@ -217,7 +217,7 @@ def _(result: FitResult) -> Table:
     for name, value, error, _, unit in result.estimate.rows():
         low, high = intervals[name]
         label = f"{name} [{unit}]" if unit else name
-        rows.append((label, f"{value:.6g}", f"{error:.2g}", f"{low:.5g} to {high:.5g}"))
+        rows.append((label, f"{value:.6g}", f"{error:.2g}", interval_text(low, high)))
     errors = ", ".join(f"{name} {x:.6g}" for name, x in result.diagnostics.rmse.items())
     names = ", ".join(record.name for record in result.provenance.records)
     head = ("parameter", "value", "standard error", "95 % interval")
