@@ -1,7 +1,7 @@
 """The result of a run."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import nullcontext
 from dataclasses import dataclass, field, fields
 from functools import partial
@@ -14,6 +14,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
+from .._core.arguments import did_you_mean
 from .._core.arrays import is_known
 from .._core.compat import get_opaque_trace_state
 from .._core.readable import AbstractReadable, Table, short, table_of
@@ -111,6 +112,24 @@ class Energy(AbstractReadable):
     __repr__ = AbstractReadable.__str__
 
 
+@jtu.register_pytree_with_keys_class
+class ByName(dict[str, Any]):
+    """Series of a run by name, a pytree."""
+
+    def __missing__(self, name: object) -> None:
+        known = f"the names are: {', '.join(self) or 'none'}.{did_you_mean(str(name), self)}"
+        raise KeyError(f"The run has no {name!r} here; {known}")
+
+    def tree_flatten_with_keys(self) -> tuple[list[tuple[jtu.DictKey, Any]], tuple[str, ...]]:
+        """Values in the order of the names."""
+        return [(jtu.DictKey(name), value) for name, value in self.items()], tuple(self)
+
+    @classmethod
+    def tree_unflatten(cls, names: tuple[str, ...], values: Iterable[Any]) -> "ByName":
+        """The inverse of `tree_flatten_with_keys`."""
+        return cls(zip(names, values, strict=True))
+
+
 @partial(
     jtu.register_dataclass,
     data_fields=("t", "q", "qd", "z", "modes", "counts", "code", "end", "request", "log", "work"),
@@ -205,14 +224,15 @@ class Trajectory(AbstractReadable):
         """
         self._one_run("forces")
         forces = _forces(self.scene, self.t, self._states(), self.modes)
-        return {name: forces[name] for name in self.scene.names}  # compiled functions return them sorted by name
+        # Compiled functions return them sorted by name.
+        return ByName({name: forces[name] for name in self.scene.names})
 
     @property
     def reactions(self) -> dict[str, ConstraintReaction]:
         """Forces of each constraint along the run, by name: multipliers, generalised and Cartesian force."""
         self._one_run("reactions")
         reactions = _reactions(self.scene, self.t, self._states(), self.modes)
-        return {name: reactions[name] for name in self.scene.constraint_names}
+        return ByName({name: reactions[name] for name in self.scene.constraint_names})
 
     @property
     def mode(self) -> dict[str, Array]:
@@ -222,9 +242,9 @@ class Trajectory(AbstractReadable):
         1 closed. Switches: the sign of the guard.
         """
         if self.modes is None:
-            return {}
+            return ByName()
         modes = mode_numbers(self.modes, self.scene.mode_widths(self.q.shape[-1]))
-        return {name: modes[..., i] for i, name in enumerate(self.scene.mode_names)}
+        return ByName({name: modes[..., i] for i, name in enumerate(self.scene.mode_names)})
 
     @property
     def mode_labels(self) -> dict[str, dict[int, str]]:
@@ -257,8 +277,9 @@ class Trajectory(AbstractReadable):
         """
         self._one_run("event_forces")
         if self.modes is None:
-            return {name: jnp.zeros((0, 2, *force.shape[1:]), force.dtype) for name, force in self.forces.items()}
-        return self._once("event_forces", lambda: _event_forces(self.scene, self._log()))
+            none = {name: jnp.zeros((0, 2, *force.shape[1:]), force.dtype) for name, force in self.forces.items()}
+            return ByName(none)
+        return ByName(self._once("event_forces", lambda: _event_forces(self.scene, self._log())))
 
     def event_sides(self, series: Series) -> Float[Array, "instants 2"]:
         """A series just before and after each change of mode; zero in unused entries."""
