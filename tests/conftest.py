@@ -133,7 +133,7 @@ def run_command():
         out, errors = io.StringIO(), io.StringIO()
         with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(errors):
             # The tests have started JAX already, in double precision.
-            patch.setattr(_app, "_start", lambda: None)
+            patch.setattr(_app, "_start", lambda *_files: None)
             patch.setattr(sys, "argv", ["jaxmodsim", *arguments])
             with pytest.raises(SystemExit) as ending:
                 _app.run()

@@ -146,8 +146,12 @@ def test_problems_do_not_wait_for_scipy() -> None:
 
 
 @pytest.mark.quick
-@pytest.mark.parametrize("words", [["--help"], ["fit", "--help"], ["sweep", "--help"]], ids=" ".join)
-def test_help_loads_nothing_that_takes_long(words: list[str]) -> None:
+@pytest.mark.parametrize(
+    "words",
+    [["--help"], ["fit", "--help"], ["sweep", "--help"], ["fit", "none.csv"], ["export", "none.toml", "a.fmu"]],
+    ids=" ".join,
+)
+def test_help_and_missing_files_load_nothing_that_takes_long(words: list[str]) -> None:
     arguments = ["jaxmodsim", *words]
     run = f"import sys; sys.argv = {arguments}\nfrom jaxmodsim.cli import main\ntry: main()\nexcept SystemExit: pass"
     slow = {"jax", "numpy", "scipy", "pandas", "matplotlib", "diffrax"}

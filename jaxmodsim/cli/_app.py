@@ -35,8 +35,16 @@ def run() -> None:
         raise
 
 
-def _start() -> None:
-    """Set what an application may set and a library must not: double precision, XLA's flags, a compilation cache."""
+def _start(*files: Path) -> None:
+    """Set what an application may set and a library must not: double precision, XLA's flags, a compilation cache.
+
+    **Raises:**
+
+    - `ValueError` if one of `files` is missing, before anything slow.
+    """
+    for path in files:
+        if not path.exists():
+            raise ValueError(f"There is no file {path}.")
     import jax
 
     from .._core.speed import tune_cpu
@@ -76,7 +84,7 @@ def fit(request: FitRequest) -> None:
     Ctrl-C ends the search; its result so far is written, and the exit code is 130.
     """
     check_axis(request)
-    _start()
+    _start(*request.records, *request.held_out)
     if request.axis == "servo":
         from ._servo import run_servo_fit
 
@@ -94,7 +102,7 @@ def predict(request: PredictRequest) -> None:
 
     Writes for each RECORD a CSV of t, q, lower and upper, a JSON summary and a figure.
     """
-    _start()
+    _start(request.fit, *request.records)
     from ._servo import run_servo_prediction
 
     run_servo_prediction(request)
@@ -125,7 +133,7 @@ def sweep(request: SweepRequest) -> None:
     where take is end, max, min, mean, rms or ptp (the largest minus the smallest
     value) of the saved times, or peak, the largest magnitude at any time.
     """
-    _start()
+    _start(request.spec)
     from ._sweep import run_sweep
 
     run_sweep(request)
@@ -142,7 +150,7 @@ def orbit(spec: SpecFile, out: Out = Path("jaxmodsim-orbit")) -> None:
     name of the number that is the angular frequency of the force. Without
     both, the period is computed. Also rtol, atol.
     """
-    _start()
+    _start(spec)
     from ._orbits import run_orbit
 
     run_orbit(spec, out)
@@ -157,7 +165,7 @@ def branch(spec: SpecFile, out: Out = Path("jaxmodsim-branch")) -> None:
     that range; max_orbits; start = "Hopf" for orbits from the first Hopf point
     of the equilibria, which are continued from q0.
     """
-    _start()
+    _start(spec)
     from ._orbits import run_branch
 
     run_branch(spec, out)
@@ -177,7 +185,7 @@ def export(
     platforms, a list such as \["x86_64-linux"], by default all that the
     compilers here support.
     """
-    _start()
+    _start(spec)
     from ._export import run_export
 
     run_export(spec, model)
