@@ -8,11 +8,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from ..._core.arguments import as_label
-from ..._core.arrays import PerDof, Scalar
-from ..._core.functions import StateDependent, as_function, is_state_dependent, result_shape
+from ..._core.arrays import PerDof, Scalar, is_known
+from ..._core.functions import StateDependent, as_function, depends_on, is_state_dependent, result_shape
 from ..._core.parameters import Default, Number, Range, as_number, check_ranges, modules_of, optional_parameter
 from ..._core.position import PositionFn, as_position_fn
 from ..._core.safe import safe_norm
@@ -202,6 +203,7 @@ class Friction(AbstractEffect):
                 f"Friction {name!r}: ellipse needs slip that is a vector of two components, but slip has the shape"
                 f" {slip}: return a position of shape (2,) from along."
             )
+        self._check_direction(q, params, name)
         load = None if self.load_constraint is not None else self.normal_force
         varying = [x for _, x in modules_of(self.law) if isinstance(x, StateDependent)]
         state = {"t": q[0], "q": q, "qd": qd, "params": params}
@@ -213,6 +215,18 @@ class Friction(AbstractEffect):
             given = result_shape(fn, **args, name=f"{label} of Friction {name!r}") if callable(fn) else wanted
             if given != wanted:
                 raise ValueError(f"Friction {name!r}: {label} returned the shape {given}, but {wanted} is needed.")
+
+    def _check_direction(self, q: PerDof, params: PyTree, name: str) -> None:
+        """Refuse a displacement whose gradient is zero for all q and params; one that vanishes at some is allowed."""
+        if depends_on(lambda q: self.direction(q, params), q):
+            return
+        with jax.ensure_compile_time_eval():
+            direction = self.direction(jnp.ones(q.shape, q.dtype), params)
+        if is_known(direction) and not np.asarray(direction).any():
+            raise ValueError(
+                f"Friction {name!r}: the displacement along(q) never changes with q, so the friction would have no"
+                " effect. Return a displacement that moves, as in along=lambda q: q[0]."
+            )
 
     def _shape(self, q: Any, params: PyTree, name: str) -> tuple[int, ...] | None:
         """Shape of the displacement."""
