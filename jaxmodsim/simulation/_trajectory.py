@@ -120,7 +120,7 @@ class ByName(dict[str, Any]):
         known = f"the names are: {', '.join(self) or 'none'}.{did_you_mean(str(name), self)}"
         raise KeyError(f"The run has no {name!r} here; {known}")
 
-    def tree_flatten_with_keys(self) -> tuple[list[tuple[jtu.DictKey, Any]], tuple[str, ...]]:
+    def tree_flatten_with_keys(self) -> tuple[list[tuple[Any, Any]], tuple[str, ...]]:
         """Values in the order of the names."""
         return [(jtu.DictKey(name), value) for name, value in self.items()], tuple(self)
 

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 import jaxmodsim as jms
-from jaxmodsim.scene import replace_elements
+from jaxmodsim.scene import State, replace_elements
 from jaxmodsim.simulation import MAX_STEPS, outcome_messages
+from jaxmodsim.simulation._outcome import PENETRATES, describe_failure
 from jaxmodsim.simulation._solve import compiled_runs
 from tests.helpers.impacts import ball_on_table, mass_in_a_dry_box
 
@@ -196,6 +197,12 @@ def test_a_violated_start_is_refused_before_the_run_is_compiled():
         with pytest.raises(ValueError, match=error):
             jms.simulate(floor, q, qd, 1.0)
     assert compiled_runs() == before
+
+
+def test_a_missed_impact_names_its_contact():
+    floor = jms.Scene(_thrown, constraints=(jms.Contact(_over, name="floor"),))
+    text = describe_failure(floor, 0.5, State(jnp.array([0.0, -0.02]), jnp.zeros(2), {}), PENETRATES)
+    assert text.startswith("The run missed an impact at contact 'floor': its gap is negative, -0.02. Pass smaller")
 
 
 def test_a_gap_that_a_linear_signal_moves_is_refused():

@@ -153,7 +153,7 @@ def test_a_batch_equals_a_loop_and_a_sick_lane_harms_no_other() -> None:
         np.testing.assert_allclose(runs.q[lane], single.q, rtol=1e-10, atol=1e-14)
     with pytest.raises(ValueError, match=r"holds a batch of runs.*jax.vmap\(lambda run: run.forces\)"):
         _ = runs.forces
-    forces = jax.vmap(lambda run: run.forces["friction"])(runs)
+    forces = jax.vmap(lambda run: run.forces)(runs)["friction"]
     np.testing.assert_allclose(forces[2], alone(scenes[2]).forces["friction"], rtol=1e-8)
 
 
