@@ -60,7 +60,7 @@ def passed(angle: Any) -> Any:
     passage = pass_event(
         landed,
         lambda t, y, mode, args: (jnp.stack([y[1], -mode * y[0]]), y[:1]),
-        (None, None),
+        (None, None, None),
         lambda t, y: (jnp.stack([y[0], -0.8 * y[1]]), w),
     )
     return jnp.append(passage.y, passage.t)
