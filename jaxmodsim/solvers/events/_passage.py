@@ -46,7 +46,7 @@ class Passage(NamedTuple):
 
     - `t`: time of the event.
     - `before`: y before the reset; the mode is that of the step.
-    - `after`: y and mode after it, and the rate of y at the end of the step.
+    - `after`: y and mode after it, and the rate of y.
     - `y`, `guards`: y at the end of the step, and the guards there.
     """
 
@@ -130,7 +130,7 @@ def pass_event(
     begin = _Place(landed.t, landed.y, landed.mode, (landed.t, landed.y), jnp.zeros_like(rate), jnp.asarray(False))
     _, (t, before, (y, mode, rates), guards) = jax.lax.scan(onward, begin, turns)
     at, end = (lambda tree, i=i: jtu.tree_map(lambda x: x[i], tree) for i in (_RESET, _COUNT - 1))
-    return Passage(at(t), at(before), (at(y), at(mode), end(rates)), end(y), end(guards))
+    return Passage(at(t), at(before), (at(y), at(mode), at(rates)), end(y), end(guards))
 
 
 def choose(where: Bool[Array, ""], one: PyTree, other: PyTree) -> PyTree:
