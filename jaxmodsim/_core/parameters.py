@@ -1,6 +1,7 @@
 """Numbers of a scene: their conversion, admissible ranges and error messages."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -145,10 +146,13 @@ def check_not_nan(leaves: Iterable[object], numbers: Callable[[], Mapping[str, A
 
 
 def _has_nan(x: Any) -> bool:
-    if getattr(getattr(x, "dtype", None), "kind", "") != "f" or not is_known(x):
-        return isinstance(x, float) and x != x
-    value = x.item() if x.ndim == 0 else None  # for one number NumPy takes longer than Python
-    return value != value if value is not None else bool(np.isnan(np.asarray(x)).any())
+    if not is_known(x):
+        return False
+    array = np.asarray(x)
+    if array.ndim == 0:  # every run looks at every number, and Python takes less time than NumPy for one
+        value = array.item()
+        return isinstance(value, float) and math.isnan(value)
+    return array.dtype.kind == "f" and bool(np.isnan(array).any())
 
 
 def as_vector(value: object, *, name: str) -> Float[Array, " n"]:

@@ -8,7 +8,17 @@ from typing import Annotated
 
 import typer
 
-from ._options import FitRequest, Interrupted, Out, PredictRequest, SpecFile, SweepRequest, check_axis, command_of
+from ._options import (
+    FitRequest,
+    Interrupted,
+    Out,
+    PredictRequest,
+    SpecFile,
+    SweepRequest,
+    check_axis,
+    check_exists,
+    command_of,
+)
 
 app = typer.Typer(
     name="jaxmodsim",
@@ -43,8 +53,7 @@ def _start(*files: Path) -> None:
     - `ValueError` if one of `files` is missing, before anything slow.
     """
     for path in files:
-        if not path.exists():
-            raise ValueError(f"There is no file {path}.")
+        check_exists(path)
     import jax
 
     from .._core.speed import tune_cpu

@@ -15,6 +15,8 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 import pandas as pd
 
+from ._options import check_exists
+
 # Columns by name, as in the file.
 Columns: TypeAlias = Mapping[str, object]
 # Bytes and lines of a CSV file that show its separators.
@@ -41,8 +43,7 @@ def read_columns(path: Path) -> Columns:
     bag = path.is_dir() and (path / "metadata.yaml").is_file()
     if path.is_dir() and not bag:
         raise ValueError(f"{path} is a folder; a file is needed.")
-    if not path.exists():
-        raise ValueError(f"There is no file {path}.")
+    check_exists(path)
     ending = ".bag" if bag else path.suffix.lower()
     if ending in _TABLE_READERS:
         return _TABLE_READERS[ending](path)

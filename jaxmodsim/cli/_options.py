@@ -221,6 +221,17 @@ class FitRequest(AbstractServoColumns):
     ] = field(default_factory=list)
 
 
+def check_exists(path: Path) -> None:
+    """Refuse a path without a file or folder.
+
+    **Raises:**
+
+    - `ValueError` naming it.
+    """
+    if not path.exists():
+        raise ValueError(f"There is no file {path}.")
+
+
 def check_axis(request: FitRequest) -> None:
     """Check that options of one kind of axis are not given for the other.
 

@@ -245,8 +245,9 @@ def _observe(content: dict[str, object], where: str, series: bool) -> dict[str, 
             raise ValueError(
                 f"{_toml.inner(where, name)}: take = {table.take!r} needs the run over time, but [run] has no ts."
             )
-        reduced = peak(table.of) if table.take == "peak" else Reduced(table.of, table.take or "")
-        of = table.of if table.take is None else reduced
+        of = table.of
+        if table.take is not None:
+            of = peak(of) if table.take == "peak" else Reduced(of, table.take)
         observables[name] = of if table.unit is None else (of, table.unit)
     if not observables:
         raise ValueError(f'{where}: it is empty; name an observable, as in v_end = "qd[0]".')

@@ -1,10 +1,13 @@
-"""A run as named columns, and as tables of them."""
+"""Series of a run by name, as columns, and as tables of them."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, Shaped
 
+from .._core.arguments import did_you_mean
 from .._core.arrays import is_known
 from .._core.system import extra
 from ..scene import Quantity, Scene, quantity_of
@@ -12,6 +15,24 @@ from ..scene import Quantity, Scene, quantity_of
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
+
+
+@jtu.register_pytree_with_keys_class
+class ByName(dict[str, Any]):
+    """Series of a run by name, a pytree."""
+
+    def __missing__(self, name: object) -> None:
+        known = f"the names are: {', '.join(self) or 'none'}.{did_you_mean(str(name), self)}"
+        raise KeyError(f"The run has no {name!r} here; {known}")
+
+    def tree_flatten_with_keys(self) -> tuple[list[tuple[Any, Any]], tuple[str, ...]]:
+        """Values in the order of the names."""
+        return [(jtu.DictKey(name), value) for name, value in self.items()], tuple(self)
+
+    @classmethod
+    def tree_unflatten(cls, names: tuple[str, ...], values: Iterable[Any]) -> "ByName":
+        """The inverse of `tree_flatten_with_keys`."""
+        return cls(zip(names, values, strict=True))
 
 
 class Columns(NamedTuple):

@@ -1,7 +1,7 @@
 """The result of a run."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, field, fields
 from functools import partial
@@ -14,7 +14,6 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from .._core.arguments import did_you_mean
 from .._core.arrays import is_known
 from .._core.compat import get_opaque_trace_state
 from .._core.readable import AbstractReadable, Table, short, table_of
@@ -22,7 +21,7 @@ from ..mechanics import momentum
 from ..scene import ConstraintReaction, Scene, State, forward_dynamics, mode_numbers, quantity_of
 from ..solvers import EventLog
 from ._accuracy import Accuracy
-from ._columns import Columns, columns
+from ._columns import ByName, Columns, columns
 from ._energy_ledger import EnergyLedger, event_losses, ledger
 from ._integrated_system import Series, Work
 from ._outcome import SUCCESS, RunResult, SimulationError, outcome_messages
@@ -110,24 +109,6 @@ class Energy(AbstractReadable):
     balance: Float[Array | np.ndarray, "*runs time"]
 
     __repr__ = AbstractReadable.__str__
-
-
-@jtu.register_pytree_with_keys_class
-class ByName(dict[str, Any]):
-    """Series of a run by name, a pytree."""
-
-    def __missing__(self, name: object) -> None:
-        known = f"the names are: {', '.join(self) or 'none'}.{did_you_mean(str(name), self)}"
-        raise KeyError(f"The run has no {name!r} here; {known}")
-
-    def tree_flatten_with_keys(self) -> tuple[list[tuple[Any, Any]], tuple[str, ...]]:
-        """Values in the order of the names."""
-        return [(jtu.DictKey(name), value) for name, value in self.items()], tuple(self)
-
-    @classmethod
-    def tree_unflatten(cls, names: tuple[str, ...], values: Iterable[Any]) -> "ByName":
-        """The inverse of `tree_flatten_with_keys`."""
-        return cls(zip(names, values, strict=True))
 
 
 @partial(

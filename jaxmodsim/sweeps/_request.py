@@ -161,11 +161,10 @@ def _check_ranges(scene: Scene, leaves: Mapping[str, str], swept: Mapping[str, n
     """Refuse values out of range; the runs check limits that are arrays, or change as well. `leaves`: their arrays."""
     numbers = scene_numbers(scene)
     for number, allowed in scene_ranges(scene).items():
-        pair = [each for each in (number, allowed.lower) if isinstance(each, str)]
+        pair = {each for each in (number, allowed.lower) if isinstance(each, str)}
         for name, leaf in leaves.items():
-            if leaf not in pair or any(
-                each != leaf and (each in leaves.values() or numbers[each].shape) for each in pair
-            ):
+            others = pair - {leaf}
+            if others == pair or any(each in leaves.values() or numbers[each].shape for each in others):
                 continue
             now = {**numbers, leaf: swept[name]}
             wrong = np.argwhere(~np.asarray(allowed.holds(now[number], now))).tolist()

@@ -96,18 +96,25 @@ def test_many_lanes_are_sorted_and_put_back() -> None:
     assert whole["m"].dims == ("sample",)
 
 
-def test_a_lane_that_fails_stays_alone(found: xr.Dataset) -> None:
-    """Runs with a negative mass: codes with sentences, and NaN."""
-    mass = MASS.copy()
-    mass[3] = -1.0
-    broken = box_sweep(over={"friction.sigma0": SIGMA0, "m": mass})
+def test_a_lane_that_fails_stays_alone() -> None:
+    """One run with a negative mass, one whose parameter is out of range: codes with sentences, and NaN."""
+
+    def of(stiction: np.ndarray, mass: np.ndarray) -> xr.Dataset:
+        law = {"friction.sigma0": SIGMA0, "friction.Fc": np.full(9, 1.5), "friction.Fs": stiction}
+        return box_sweep(over={"law": law, "m": mass})
+
+    stiction, mass = np.full(9, 1.75), MASS.copy()
+    found = of(stiction, mass)
+    stiction[2], mass[3] = 1.0, -1.0
+    broken = of(stiction, mass)
     bad = np.zeros((9, 14), bool)
-    bad[:, 3] = True
+    bad[2], bad[:, 3] = True, True
     np.testing.assert_array_equal(broken["result"] != 0, bad)
     assert np.isnan(broken["v"].values[bad]).all()
     assert np.isnan(broken["peak"].values[bad]).all()
     np.testing.assert_allclose(broken["v"].values[~bad], found["v"].values[~bad], rtol=1e-11, atol=1e-14)
     sentences = broken["result"].attrs["flag_meanings"]
+    assert "Fs must be" in sentences[int(broken["result"][2, 0])]
     assert "mass matrix" in sentences[int(broken["result"][0, 3])].lower()
 
 

@@ -220,8 +220,8 @@ class Friction(AbstractEffect):
         """Refuse a displacement whose gradient is zero for all q and params; one that vanishes at some is allowed."""
         if depends_on(lambda q: self.direction(q, params), q):
             return
-        with jax.ensure_compile_time_eval():
-            direction = self.direction(jnp.ones(q.shape, q.dtype), params)
+        with jax.ensure_compile_time_eval():  # one program: each operation alone would compile as well
+            direction = jax.jit(lambda q: self.direction(q, params))(np.ones(q.shape, q.dtype))
         if is_known(direction) and not np.asarray(direction).any():
             raise ValueError(
                 f"Friction {name!r}: the displacement along(q) never changes with q, so the friction would have no"
