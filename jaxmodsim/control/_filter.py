@@ -290,7 +290,7 @@ class FrictionFilter(eqx.Module):
         `void NAME(h, u, y, x, s, x_after, s_after, innovation)` has the inputs during the time h in `u` (without
         inputs it is left out), the measurement in `y` (NaN for an absent channel), and the state as mean `x[n]` and
         factor `s[n * n]`. `x_after` and `s_after` may be the same arrays. The numbers of the scene are constants of the
-        code; nothing may depend on time explicitly. `transform` must be `linearized`.
+        code; nothing may depend on time explicitly.
 
         **Arguments:**
 

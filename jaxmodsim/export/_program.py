@@ -255,11 +255,12 @@ class _StatementWriter(AbstractScalars):
             out[i] = entries[places[i]]
         return out
 
-    def choose(self, test: Value, one: Parts, other: Parts) -> Parts:
-        """`one` if `test` is true, else `other`."""
+    def choose(self, test: Parts, one: Parts, other: Parts) -> Parts:
+        """`one` where `test`, which has the leading axes of both, is true, else `other`."""
         out = np.empty(one.shape, object)
         for i in np.ndindex(*out.shape):
-            out[i] = self.apply(jax.lax.select_n, "select_n", {}, [test, other[i], one[i]])
+            chosen = test[i[: test.ndim]]
+            out[i] = self.apply(jax.lax.select_n, "select_n", {}, [chosen, other[i], one[i]])
         return out
 
     def argument(self, compute: Callable[..., Any], name: str, params: Params, x: Parts) -> Parts:
@@ -283,7 +284,7 @@ class _StatementWriter(AbstractScalars):
             x = slices[0]
             for k in range(1, last + 1):
                 beyond = self.apply(jax.lax.ge, "ge", {}, [at, at.dtype.type(k)])
-                x = self.choose(beyond, slices[k], x)
+                x = self.choose(_scalar_array(beyond), slices[k], x)
         return x
 
     def scatter_add(self, eqn: JaxprEqn, x: Parts, updates: Parts, places: np.ndarray) -> Parts:
@@ -316,15 +317,22 @@ class _StatementWriter(AbstractScalars):
         same = [a is b for a, b in zip(body.jaxpr.outvars, body.jaxpr.invars[n_body:], strict=True)]
         symbols = [x if kept else _symbols(x) for x, kept in zip(starts, same, strict=True)]
         with self.inner_block() as head:
-            (condition,) = self.parts(self.run(test.jaxpr, test.consts, [*test_consts, *symbols])[0]).flat
+            # Under vmap one condition for each member, whose variables change while its own condition is true.
+            conditions = self.parts(self.run(test.jaxpr, test.consts, [*test_consts, *symbols])[0])
+            condition = functools.reduce(lambda a, b: self.apply(jax.lax.bitwise_or, "or", {}, [a, b]), conditions.flat)
             self.block = []
             after = [self.parts(x) for x in self.run(body.jaxpr, body.consts, [*body_consts, *symbols])]
+            changed = [
+                each for each, kept in zip(zip(symbols, starts, after, strict=True), same, strict=True) if not kept
+            ]
+            carries = [Carry(*each) for parts in changed for each in zip(*(x.flat for x in parts), strict=True)]
+            bound = max(self.bound(each, carries) for each in conditions.flat)
+            if conditions.ndim:
+                held = [self.choose(conditions, x, symbol) for symbol, _, x in changed]
+                flat = [x for parts in held for x in parts.flat]
+                carries = [carry._replace(after=x) for carry, x in zip(carries, flat, strict=True)]
             inside = self.block
-        changed = [
-            parts for parts, kept in zip(zip(symbols, starts, after, strict=True), same, strict=True) if not kept
-        ]
-        carries = [Carry(*each) for parts in changed for each in zip(*(x.flat for x in parts), strict=True)]
-        self.block.append(Loop(self.bound(condition, carries), carries, head, condition, inside))
+        self.block.append(Loop(bound, carries, head, condition, inside))
         return list(symbols)
 
     def scan(self, params: Params, inputs: list[Value]) -> list[Value]:

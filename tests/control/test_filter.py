@@ -169,9 +169,10 @@ def test_errors_name_what_is_wrong():
 
 @pytest.mark.skipif(COMPILER is None or "jaxprs" not in AVAILABLE, reason="needs a C compiler and traced programs")
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
-def test_the_cycle_in_c_is_that_in_jax(dtype, tmp_path: Path):
+@pytest.mark.parametrize("transform", [linearized, unscented])
+def test_the_cycle_in_c_is_that_in_jax(transform, dtype, tmp_path: Path):
     scene = jax.tree.map(lambda x: x.astype(dtype), axis())
-    filter = FrictionFilter(scene, 1e-5, DRIFT, numbers=(LEVEL,))
+    filter = FrictionFilter(scene, 1e-5, DRIFT, numbers=(LEVEL,), transform=transform)
     source, library = tmp_path / "filter.c", tmp_path / "filter.so"
     source.write_text(filter.to_c("axis_filter", inputs=("u",)))
     flags = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-O1", "-shared", "-fPIC"]

@@ -1,5 +1,6 @@
 """Scenes as C99: compiled, run, and compared with JAX."""
 
+import ctypes
 import functools
 import shutil
 import subprocess
@@ -296,6 +297,26 @@ def test_the_text_names_its_numbers_and_allocates_nothing() -> None:
         assert word in text
     for word in ("malloc", "static", "goto", "while"):
         assert word not in text
+
+
+@needs_compiler
+def test_members_of_a_batched_loop_end_on_their_own(tmp_path: Path) -> None:
+    def halvings(x: Any) -> Any:
+        """Halves a number until it is below one, at most 60 times; the second result counts."""
+        return jax.lax.while_loop(
+            lambda each: (each[1] < 60.0) & (each[0] > 1.0), lambda each: (0.5 * each[0], each[1] + 1.0), (x, 0.0 * x)
+        )
+
+    like = {"x": jnp.zeros(4)}
+    code = jms.export.function_to_c(jax.vmap(halvings), like, ("y", "n"), name="halve", purpose="Halvings.")
+    source, library = tmp_path / "halve.c", tmp_path / "halve.so"
+    source.write_text(code)
+    subprocess.run([str(COMPILER), *FLAGS, "-shared", "-fPIC", str(source), "-o", str(library)], check=True)
+    x, y, n = np.array([0.5, 3.0, 1e6, 1e30]), np.zeros(4), np.zeros(4)
+    pointers = [a.ctypes.data_as(ctypes.POINTER(ctypes.c_double)) for a in (x, y, n)]
+    ctypes.CDLL(str(library)).halve(*pointers)
+    np.testing.assert_array_equal(n, [0, 2, 20, 60])
+    np.testing.assert_array_equal(y, x / 2**n)
 
 
 def with_force(force: Any) -> jms.Scene:
