@@ -1,4 +1,4 @@
-"""The command line: `jaxmodsim demo | testbench | fit | predict | sweep | orbit | branch | bench | cache`."""
+"""The command line: `jaxmodsim demo | testbench | fit | predict | sweep | orbit | branch | export | cache`."""
 
 import os
 import sys

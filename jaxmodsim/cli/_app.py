@@ -1,7 +1,6 @@
 """The commands. Everything heavy is imported inside them, so that --help and usage errors come at once."""
 
 import logging
-import subprocess
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -198,34 +197,6 @@ def export(
     from ._export import run_export
 
     run_export(spec, model)
-
-
-@app.command("bench", context_settings={"ignore_unknown_options": True})
-def run_benches(
-    arguments: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="NAME", help="Benches, such as a0, and options of python -m bench; by default all."),
-    ] = None,
-) -> None:
-    """Run the benches of a clone of the repository, which measure time and accuracy.
-
-    The installed package has no benches: this runs `python -m bench` in the clone around the working directory, with
-    its options --list, --smoke, --jobs, --out and --jaxonomy.
-    """
-    # The package's own clone comes last: in another clone, its benches are meant.
-    folders = dict.fromkeys([Path.cwd(), Path(__file__).resolve().parents[2]])
-    root = next((folder for folder in folders if (folder / "bench" / "__main__.py").is_file()), None)
-    if root is None:
-        raise ValueError(
-            f"there is no folder bench in {' or '.join(map(str, folders))}: benches are not installed with the package."
-            " Run this in a clone of the repository, installed by pip install -e '.[bench]'."
-        )
-    with subprocess.Popen([sys.executable, str(root / "bench"), *(arguments or [])]) as process:
-        while True:
-            try:
-                raise typer.Exit(process.wait())
-            except KeyboardInterrupt:  # the suite ends by itself
-                continue
 
 
 @app.command()

@@ -12,9 +12,8 @@ import pytest
 from bench import render
 from bench.layout import Recorded, Table, Targets
 from bench.tables import REPORTS
-from jaxmodsim.cli import _app
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[1]
 RESULTS = sorted((ROOT / "bench" / "results").glob("*.json"))
 
 # In the place of `bench/one.py`: writes a result, as clean as its name says.
@@ -118,20 +117,6 @@ def test_an_interrupt_leaves_finished_results(suite):
     assert "rendered" not in rest
     assert "long                     not finished" in rest
     assert (suite.folder / "results" / "good.json").exists()
-
-
-def test_the_command_says_where_it_looked(run_command, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(_app, "__file__", str(tmp_path / "site-packages" / "jaxmodsim" / "cli" / "_app.py"))
-    code, _, errors = run_command("bench")
-    assert code == 2
-    assert f"there is no folder bench in {tmp_path} or {tmp_path / 'site-packages'}" in errors
-
-
-def test_the_command_runs_the_suite_of_the_clone(suite, run_command, monkeypatch):
-    monkeypatch.chdir(suite.folder.parent)
-    assert run_command("bench", "bad", "--smoke")[0] == 1
-    assert run_command("bench", "good", "--list")[0] == 0
 
 
 def test_every_bench_has_a_result_a_layout_and_a_line_in_the_pages():
