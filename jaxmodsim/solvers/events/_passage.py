@@ -9,6 +9,9 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from ..._core.compat import eqxi
+from ._state import Landing
+
 # Factor by which the distance to a root in the step and in the passage may differ.
 LATITUDE = 4.0
 
@@ -131,6 +134,61 @@ def pass_event(
     _, (t, before, (y, mode, rates), guards) = jax.lax.scan(onward, begin, turns)
     at, end = (lambda tree, i=i: jtu.tree_map(lambda x: x[i], tree) for i in (_RESET, _COUNT - 1))
     return Passage(at(t), at(before), (at(y), at(mode), at(rates)), end(y), end(guards))
+
+
+def in_turn(
+    way: Callable[..., tuple[Passage, PyTree, PyTree]],
+    at_end: tuple[Array, PyTree, PyTree, Float[Array, " guards"]],
+    landing: Landing,
+    near: Float[Array, ""],
+) -> tuple[Passage, PyTree]:
+    """The event of all guards that fire, the state after it with the derivatives of all their times.
+
+    One reset for all of them, at the root of the first, decides. But each of the roots has a derivative of its own. So
+    the guards also fire one by one, each at its root. If that gives the same modes and the same state, up to the motion
+    within the landing distance, the state is that: their order has no effect, and the derivative is that of each order.
+
+    **Arguments:**
+
+    - `way`: `way(y, mode, first, fired)` -> the passage of an event, the rate of y before it, and more.
+    - `at_end`: time, y, mode and guards at the end of the step.
+    - `landing`: the guards that fire, and their roots. `near`: the landing distance [time].
+
+    **Returns:**
+
+    The passage, and the third result of `way`, for all guards at once.
+    """
+    (t, y, mode, guards), (fired, first, ahead) = at_end, landing[:3]
+    n = fired.shape[0]
+    if n == 1:
+        passage, _, more = way(y, mode, first, fired)
+        return passage, more
+    earlier = (ahead[:, None] < ahead) | ((ahead[:, None] == ahead) & (jnp.arange(n)[:, None] < jnp.arange(n)))
+    place = jnp.sum(earlier & fired[:, None], axis=0)
+    one = fired & (place == jnp.arange(n)[:, None])
+    several = jnp.any(one[1])
+    active = jnp.concatenate([jnp.ones(1, bool), jnp.any(one, axis=1) & several])
+    nothing = Passage(t, y, (y, mode, y), y, guards), y, (near, near)
+
+    def turn(at: tuple[PyTree, PyTree], marks: tuple[Array, Array, Array, Array]) -> tuple[PyTree, PyTree]:
+        first, fires, acts, alone = marks
+        # Under vmap, too, a turn without a guard costs nothing.
+        out = jax.lax.cond(eqxi.unvmap_any(acts), lambda: way(*at, first, fires), lambda: nothing)
+        return choose(acts & alone, (out[0].y, out[0].after[1]), at), out
+
+    every = (jnp.concatenate([first[None], one]), jnp.concatenate([fired[None], one]), active, jnp.arange(n + 1) > 0)
+    (y, mode), out = jax.lax.scan(turn, (y, mode), every)
+    passage, before, more = jtu.tree_map(lambda x: x[0], out)
+    _, now, slope = passage.after
+
+    def apart(a: Array, b: Array, before: Array, slope: Array, ends: Array, resets: Array) -> Bool[Array, ""]:
+        """Whether two states differ by more than the motion within the landing distance, and rounding."""
+        motion = near * (jnp.abs(before) + jnp.abs(slope)) + jnp.max(jnp.abs(ends - resets), axis=0)
+        return jnp.any(jnp.abs(a - b) > LATITUDE * motion + 64.0 * float(jnp.finfo(a.dtype).eps) * jnp.abs(a))
+
+    far = jtu.tree_leaves(jtu.tree_map(apart, passage.y, y, before, slope, out[0].y, out[0].after[0]))
+    far += jtu.tree_leaves(jtu.tree_map(lambda a, b: jnp.any(a != b), now, mode))
+    return passage._replace(y=choose(several & ~jnp.any(jnp.stack(far)), y, passage.y)), more
 
 
 def choose(where: Bool[Array, ""], one: PyTree, other: PyTree) -> PyTree:

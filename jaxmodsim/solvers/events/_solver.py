@@ -14,7 +14,7 @@ from ..._core.arrays import Real, fusion_barrier, opaque_one
 from .._projected import projected
 from .._wrapper import AbstractSolverWrapper
 from ._guard_scan import GuardScan, arrives, first_root, instant, scan_guards
-from ._passage import LATITUDE, Landed, choose, pass_event
+from ._passage import LATITUDE, Landed, Passage, choose, in_turn, pass_event
 from ._policy import AbstractGuardPolicy, Conditions, Crossings
 from ._samples import SampledJumps, on_jump
 from ._state import ACCUMULATION, ONGOING, TOO_MANY, EventLog, EventMemory, EventState, Landing, StepReport, write
@@ -371,7 +371,7 @@ class EventSolver(AbstractSolverWrapper):
         behind = landing(ahead)[coming]
         near = jnp.sum(jnp.where(first, near, 0.0))
         next_end = self._policy.next_end(ahead, missed, (behind, divisor))
-        return Landing(fired, first, missed, landed, landed, next_end, near)
+        return Landing(fired, first, seen.ahead, missed, landed, landed, next_end, near)
 
     def _guard_rates(self, t: Array, state: EventState, slope: PyTree, args: PyTree) -> Float[Array, " guards"]:
         """Rates of the guards along the motion; constant."""
@@ -392,7 +392,7 @@ class EventSolver(AbstractSolverWrapper):
 
         Returned with the time from which the new state holds, and the rate of y there.
         """
-        (state, memory), (root, near), (args, whole), (fired, first) = at_end, places, sides, landing[:2]
+        (state, memory), (root, near), (args, whole), fired = at_end, places, sides, landing.fired
         # Arguments after the event are those of the step that begins there.
         new_args = whole if self.samples is None else self.samples.freeze_args(t, whole)
         # An event within no distance is at a jump of the samples: the way back from it is before the jump.
@@ -402,22 +402,26 @@ class EventSolver(AbstractSolverWrapper):
             here = state._replace(y=y, mode=mode)
             return terms.vf(t, here, args).y, self._guards(t, here, args)
 
-        held = _held((t, state, args))
-        rates = self._guard_rates(t, state, terms.vf(*held).y, args)
-        rate = jnp.sum(jnp.where(first, rates, 0.0))
-        rate = jnp.where(rate == 0, 1.0, rate)
+        def way(y: PyTree, mode: PyTree, first: Array, fires: Array) -> tuple[Passage, PyTree, tuple[Array, Array]]:
+            """Through the event of the guards `fires`; with the rates of y and of the first guard, and `early`."""
+            here = state._replace(y=y, mode=mode)
+            slope = terms.vf(*_held((t, here, args))).y
+            rate = jnp.sum(jnp.where(first, self._guard_rates(t, here, slope, args), 0.0))
+            rate = jnp.where(rate == 0, 1.0, rate)
 
-        def reset(t_event: Array, y: PyTree) -> tuple[PyTree, PyTree]:
-            dense = _spread(t_event, state.t, memory)[1] & self.carries_on
-            after = self.reset(t_event, state._replace(y=y, dense=dense), whole, fired)
-            return after.y, after.mode
+            def reset(t_event: Array, y: PyTree) -> tuple[PyTree, PyTree]:
+                dense = _spread(t_event, state.t, memory)[1] & self.carries_on
+                after = self.reset(t_event, here._replace(y=y, dense=dense), whole, fires)
+                return after.y, after.mode
 
-        # The event of a guard that arrives is at its value `root`, that of others at zero, `early` later.
-        level = jnp.sum(jnp.where(first, root, 0.0))
-        arrives = jnp.any(first & (memory.guard > 0))
-        early, level = jnp.where(arrives, 0.0, level / jnp.abs(rate)), jnp.where(arrives, level, 0.0)
-        landed = Landed(t, state.y, state.mode, first, (level, rate), landing.landed, near, state.t)
-        passage = pass_event(landed, evaluate, (args, back, new_args), reset)
+            # The event of a guard that arrives is at its value `root`, that of others at zero, `early` later.
+            level = jnp.sum(jnp.where(first, root, 0.0))
+            arrives = jnp.any(first & (memory.guard > 0))
+            early, level = jnp.where(arrives, 0.0, level / jnp.abs(rate)), jnp.where(arrives, level, 0.0)
+            landed = Landed(t, y, mode, first, (level, rate), landing.landed, near, state.t)
+            return pass_event(landed, evaluate, (args, back, new_args), reset), slope, (rate, early)
+
+        passage, (rate, early) = in_turn(way, (t, state.y, state.mode, memory.guard), landing, near)
         t_event, values, (y, mode, slope) = passage.t, passage.guards, passage.after
         spread, dense = _spread(t_event, state.t, memory)
         ends = dense & (not self.carries_on)

@@ -90,6 +90,7 @@ class Landing(NamedTuple):
     """Events at the end of a step.
 
     - `fired`, `first`: the guards that fire, and the first of them, shape `[guards]`.
+    - `ahead`: distance of the roots from the end of the step, in steps, shape `[guards]`.
     - `missed`: whether the step has passed a root.
     - `landed`: whether it ends on one.
     - `happens`: whether the state is to be reset.
@@ -99,6 +100,7 @@ class Landing(NamedTuple):
 
     fired: Bool[Array, " guards"]
     first: Bool[Array, " guards"]
+    ahead: Float[Array, " guards"]
     missed: Bool[Array, ""]
     landed: Bool[Array, ""]
     happens: Bool[Array, ""]
