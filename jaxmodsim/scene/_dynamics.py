@@ -224,6 +224,7 @@ class Dynamics(NamedTuple):
         mode = next_modes(
             elements, elements.slip_mode(jax.lax.stop_gradient(v), rest), still, jnp.zeros_like(still), rest
         )
+        mode = self._release(mode)
         return self._stick(mode), mode
 
     def switch_struck(
@@ -264,7 +265,21 @@ class Dynamics(NamedTuple):
             new = jnp.where(elements.in_planes(held, lambda part: jnp.any(held[part])), 0.0, new)
         # The remaining slip of a plane that stops is removed in any case: it does not determine the next direction.
         stops = elements.in_planes(elements.sticks(new), lambda part: fired[part] | elements.sticks(new)[part])
-        return self.y._replace(qd=stop_slip(elements, self.y.qd, stops)), new
+        free = self._release(new)
+        if held is not None:
+            free = jnp.where(held, new, free)
+        return self.y._replace(qd=stop_slip(elements, self.y.qd, stops)), free
+
+    def _release(self, mode: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Modes in which no element sticks under an open contact: stick would hold it in derivatives."""
+        contacts = dict(zip(self.scene.contacts, self._modes[1], strict=True))
+        loads = [each.load_constraint for each in self.scene.event_driven.values()]
+        if not any(load in contacts for load in loads):
+            return mode
+        elements, closed = self.friction_elements, jnp.ones_like(self.t)
+        free = jnp.stack([contacts.get(load, closed) == 0 for load in loads])
+        v = jax.lax.stop_gradient(elements.v[: mode.size])
+        return jnp.where(elements.in_rows(free) & (mode == 0), jnp.where(v < 0, -1.0, jnp.ones_like(v)), mode)
 
     def stick(self, mode: Modes) -> State:
         """State without the slip velocity of elements that stick in `mode`, which drifts from zero."""

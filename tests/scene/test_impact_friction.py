@@ -218,3 +218,42 @@ def test_impacts_obey_their_laws_and_poissons_gains_no_energy(n, m):
         np.testing.assert_allclose((friction + np.sign(end[:, n:]) * mu * p[:, :m])[slides], 0.0, atol=1e-9)
     gain = 0.5 * np.sum((squeeze + expand) * (v + after), axis=1)
     assert (gain < 1e-12).all()
+
+
+def test_a_body_without_slip_moves_freely_in_flight():
+    """Friction under an open contact has no load, so derivatives in flight are those of free motion, from rest too."""
+    drop, m, g = 0.2, 2.0, 9.81
+
+    def block(t, q, qd, p):
+        return 0.5 * m * jnp.sum(qd**2) - m * g * q[1]
+
+    def pull(t, q, qd, p):
+        return jnp.stack([p["F"], 0.0 * t])
+
+    ground = jms.Contact(_height, restitution=0.5, name="ground")
+    slide = jms.Friction(jms.Coulomb(0.3), along=lambda q: q[0], normal_force="ground")
+
+    @jax.jit
+    @jax.jacfwd
+    def slopes(x, end):
+        scene = jms.Scene(block, {"F": x[0]}, (jms.AppliedForce(pull), slide), constraints=(ground,))
+        run = jms.simulate(scene, [0.0, drop], jnp.stack([x[1], 0.0]), end, rtol=1e-9, atol=1e-12, throw=False)
+        return jnp.stack([run.q[-1, 0], run.qd[-1, 0]])
+
+    lands = (2.0 * drop / g) ** 0.5
+    np.testing.assert_allclose(slopes(jnp.zeros(2), 0.15), [[0.15**2 / (2 * m), 0.15], [0.15 / m, 1.0]], rtol=1e-9)
+    # The impact stops it; then it flies again. The second start slips until then.
+    end, flight = 0.3, 0.3 - lands
+    expected = [[(lands**2 + flight**2) / (2 * m), lands], [flight / m, 0.0]]
+    for speed in (0.0, 0.5):
+        np.testing.assert_allclose(slopes(jnp.array([0.0, speed]), end), expected, rtol=1e-7, atol=1e-12)
+
+
+def test_the_derivative_by_a_load_of_zero_is_that_of_a_load_above_it():
+    slide = jms.Friction(jms.Coulomb(0.3), normal_force=lambda t, q, qd, p: p["N"])
+
+    def end(load):
+        scene = jms.Scene(lambda t, q, qd, p: qd[0] ** 2, {"N": load}, (slide,))
+        return jms.simulate(scene, [0.0], [1.0], 2.0, rtol=1e-9, atol=1e-12).q[-1, 0]
+
+    np.testing.assert_allclose(jax.grad(end)(0.0), -0.3 * 2.0**2 / (2 * 2.0), rtol=1e-9)

@@ -311,7 +311,8 @@ class Friction(AbstractEffect):
         fn = self.normal_force
         if fn is None or isinstance(fn, ReactionLoad):
             return None
-        return jnp.maximum(jnp.asarray(fn(t, q, qd, params) if callable(fn) else fn), 0.0)
+        load = jnp.asarray(fn(t, q, qd, params) if callable(fn) else fn)
+        return jnp.where(load < 0, 0.0, load)  # the derivative of `maximum` at zero is a half
 
     def apply_force(self, q: PerDof, force: Float[Array, "..."], params: PyTree) -> PerDof:
         """Generalised force of the friction force `force`."""
