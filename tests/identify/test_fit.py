@@ -158,9 +158,11 @@ def test_samples_of_rest_do_not_raise_standard_errors_of_white_noise():
 
 def test_standard_errors_where_records_have_different_channels():
     def force(t, q, qd, p):
+        del t, q, qd
         return jnp.reshape(p["a"] * p["u"] + p["b"], (1,))
 
     def lagrangian(t, q, qd, p):
+        del t, q, p
         return 0.5 * qd[0] ** 2
 
     rng, t = np.random.default_rng(5), np.linspace(0.0, 4.0, 200)
@@ -389,6 +391,14 @@ def test_wrong_options_are_refused(clean, options, text):
     # Run-time type checks of the tests may come before our own; both name the argument.
     with pytest.raises((ValueError, TypeError), match=text if "1.5" not in str(options) else "substeps"):
         jms.fit(sprung(), noisy(clean, 0), ("m",), **options)
+
+
+def test_fit_law_refuses_noise_that_differs_between_records():
+    t = np.linspace(0.0, 1.0, 51)
+    motion, force = {"x": 1e-3 * np.sin(t)}, np.cos(t)
+    records = [jms.Record(t, force, motion, noise=level) for level in (1e-3, 1e-1)]
+    with pytest.raises(ValueError, match="noise of 'measured' differs between the records"):
+        jms.fit_law(jms.Dahl(sigma0=1e4, Fc=2.0), records)
 
 
 def test_fit_law_leaves_alone_what_starts_on_its_limit_and_how_the_law_is_run():
