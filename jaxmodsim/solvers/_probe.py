@@ -1,6 +1,7 @@
 """A probe: one tangent beside the state, whose error limits the steps of a differentiated run."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -51,18 +52,24 @@ def without_probe(y: PyTree) -> PyTree:
     return y.y if isinstance(y, Probed) else y
 
 
-def direction(numbers: PyTree, asked: PyTree) -> PyTree:
-    """A change of the differentiated numbers of a run, of their magnitude, with random signs and factors."""
-    rng = np.random.default_rng(35)
+def direction(step: PyTree, y0: PyTree, asked: tuple[PyTree, PyTree], controller: PyTree) -> tuple[PyTree, PyTree]:
+    """A change of the differentiated numbers of a step and of the initial state, with random signs and factors.
 
-    def change(is_asked: Any, x: Any) -> Any:
+    It has their magnitude, for a state at least about `atol/rtol`: a smaller tangent would pass for noise.
+    """
+    rng, control = np.random.default_rng(35), _pid(controller)[0]
+    resolved = lax.stop_gradient(control.atol / (control.atol + control.rtol))
+
+    def change(least: Array | float, is_asked: Any, x: Any) -> Any:
         if is_asked is None:
             return None
         part = np.exp(rng.uniform(-0.7, 0.7, x.shape)) * rng.choice((-1.0, 1.0), x.shape)
         size = jnp.abs(lax.stop_gradient(x))
-        return jnp.asarray(part, x.dtype) * jnp.where(size > 0, size, jnp.maximum(_OF_ZERO * jnp.max(size), _OF_ZERO))
+        zero, size = _OF_ZERO * jnp.maximum(jnp.max(size), 1.0), jnp.where(size > 0, jnp.maximum(size, least), 0.0)
+        return jnp.asarray(part, x.dtype) * jnp.where(size > 0, size, zero).astype(x.dtype)
 
-    return jtu.tree_map(change, asked, numbers, is_leaf=_is_none)
+    of_step = jtu.tree_map(partial(change, 0.0), asked[0], step, is_leaf=_is_none)
+    return of_step, jtu.tree_map(partial(change, resolved), asked[1], y0, is_leaf=_is_none)
 
 
 def start(

@@ -244,7 +244,7 @@ def _solve(inputs: StepInputs, fixed: _Fixed, by: StepInputs | None) -> PyTree:
     every, size, kept, keeps = fixed.how.every, fixed.max_steps, [], by is not None
     y0, step, controller = inputs.y0, inputs.step, fixed.controller
     if by is not None and fixed.probe and jtu.tree_leaves((by.step, by.y0)):
-        change = direction((inputs.step, inputs.y0), (by.step, by.y0))
+        change = direction(inputs.step, y0, (by.step, by.y0), controller)
         y0 = start(inputs.t0, y0, inputs.solver_state, change[1], fixed.project)
         step = ProbedStep(step, change[0], controller, fixed.project is not None)
         controller = ProbedController(controller)

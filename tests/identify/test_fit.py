@@ -113,6 +113,75 @@ def test_standard_errors_are_steadier_where_the_residual_is_white():
     assert np.mean(ratios[True]) == pytest.approx(1.0, abs=0.03)
 
 
+def _error_ratios(jacobian, blocks, *, memory=0.0, white=False, repeats=60):
+    """Standard errors over their true values, for noise of standard deviation one, shape [repeats, p]."""
+    rng, (n, p) = np.random.default_rng(11), jacobian.shape
+    exact = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
+    ratios = []
+    for _ in range(repeats):
+        e = rng.standard_normal(n)
+        for i in range(1, n):
+            e[i] = memory * e[i - 1] + (1 - memory**2) ** 0.5 * e[i]
+        e -= jacobian @ np.linalg.lstsq(jacobian, e, rcond=None)[0]
+        sure = covariance_estimate(e, jacobian, np.zeros((0, p)), np.eye(p), blocks, int(blocks.max()) + 1, p, white)
+        ratios.append(np.sqrt(np.diag(sure.covariance)) / exact)
+    return np.array(ratios)
+
+
+@pytest.mark.parametrize("white", [False, True])
+def test_a_parameter_that_one_block_of_samples_determines_has_a_standard_error(white):
+    # The first parameter shows in a twentieth of the record alone, or twenty records each show their own start.
+    n = 640
+    jacobian = np.stack([np.sin(np.arange(n)), np.cos(0.1 * np.arange(n))], axis=1)
+    jacobian[:, 0] *= (np.arange(n) >= 325) & (np.arange(n) < 357)
+    one = _error_ratios(jacobian, np.arange(n) * BLOCKS // n, white=white)
+    starts = np.concatenate([jacobian[:, 1:], np.arange(n)[:, None] // 32 == np.arange(20)], axis=1).astype(float)
+    for ratios in (one, _error_ratios(starts, np.arange(n) // 32, white=white)):
+        assert np.mean(ratios**2, axis=0) == pytest.approx(1.0, rel=0.35)
+        assert np.median(ratios, axis=0).min() > 0.75
+
+
+def test_correlated_noise_counts_within_a_block_that_determines_a_parameter():
+    # The mean of noise with the correlation 0.8 from sample to sample has 9 times the variance of white noise.
+    n = 3200
+    jacobian = np.ones((n, 1)) * ((np.arange(n) >= 400) & (np.arange(n) < 600))[:, None]
+    ratios = _error_ratios(jacobian, np.arange(n) * BLOCKS // n, memory=0.8)
+    assert 4.5 < np.mean(ratios**2) < 11.0  # parts of 13 samples see most of a correlation over 5
+
+
+def test_samples_of_rest_do_not_raise_standard_errors_of_white_noise():
+    n = 640
+    jacobian = np.zeros((n, 1))
+    jacobian[300:340, 0] = np.linspace(1.0, 2.0, 40)
+    assert _error_ratios(jacobian, np.arange(n) * BLOCKS // n, white=True).mean() == pytest.approx(1.0, abs=0.15)
+
+
+def test_standard_errors_where_records_have_different_channels():
+    def force(t, q, qd, p):
+        del t, q, qd
+        return jnp.reshape(p["a"] * p["u"] + p["b"], (1,))
+
+    def lagrangian(t, q, qd, p):
+        del t, q, p
+        return 0.5 * qd[0] ** 2
+
+    rng, t = np.random.default_rng(5), np.linspace(0.0, 4.0, 200)
+    u, h = np.sign(np.sin(3 * t)) + 0.3 * np.cos(7 * t), t[1]
+    inputs = [u, np.ones_like(u)]
+    velocity = np.stack([np.concatenate([[0.0], np.cumsum(u[:-1]) * h]) for u in inputs], axis=1)
+    steps = [velocity[:-1, i] * h + 0.5 * u[:-1] * h**2 for i, u in enumerate(inputs)]
+    position = np.stack([np.concatenate([[0.0], np.cumsum(step)]) for step in steps], axis=1)
+    x = position @ [2.0, 0.3] + 1e-3 * rng.standard_normal(200)
+    v = velocity @ [2.0, 0.3] + 0.1 * rng.standard_normal(200)
+    records = [jms.Record(t, {"x": x}, {"u": u}, "first"), jms.Record(t, {"v": v}, {"u": u}, "second")]
+    scene = jms.Scene(lagrangian, {"a": 1.0, "b": 0.0, "u": 0.0}, (jms.AppliedForce(force),))
+    result = jms.fit(scene, records, ("a", "b"), observe={"x": "q[0]", "v": "qd[0]"}, q0=[0.0], qd0=[0.0])
+    exact = np.sqrt(np.diag(np.linalg.inv(position.T @ position / 1e-6 + velocity.T @ velocity / 1e-2)))
+    ratios = np.array(list(result.errors.values())) / exact
+    # Over 80 records the ratio lay between 0.39 and 1.57, with a median of 0.98.
+    assert ((ratios > 0.35) & (ratios < 1.7)).all()
+
+
 def test_a_parameter_without_effect_is_reported_and_not_given_an_error_of_zero(clean):
     law = jms.LuGre(sigma0=2e4, sigma1=0.0, sigma2=0.5, Fc=1.0, Fs=1.2, vs=1e-9)
     t, _, q = clean
@@ -322,6 +391,14 @@ def test_wrong_options_are_refused(clean, options, text):
     # Run-time type checks of the tests may come before our own; both name the argument.
     with pytest.raises((ValueError, TypeError), match=text if "1.5" not in str(options) else "substeps"):
         jms.fit(sprung(), noisy(clean, 0), ("m",), **options)
+
+
+def test_fit_law_refuses_noise_that_differs_between_records():
+    t = np.linspace(0.0, 1.0, 51)
+    motion, force = {"x": 1e-3 * np.sin(t)}, np.cos(t)
+    records = [jms.Record(t, force, motion, noise=level) for level in (1e-3, 1e-1)]
+    with pytest.raises(ValueError, match="noise of 'measured' differs between the records"):
+        jms.fit_law(jms.Dahl(sigma0=1e4, Fc=2.0), records)
 
 
 def test_fit_law_leaves_alone_what_starts_on_its_limit_and_how_the_law_is_run():

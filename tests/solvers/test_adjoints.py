@@ -19,6 +19,7 @@ from jaxmodsim import (
     Rodas5P,
     Scene,
     StoredSteps,
+    Viscous,
     simulate,
 )
 
@@ -231,6 +232,24 @@ def test_derivatives_of_a_resting_place_are_exact_to_rounding() -> None:
         slope = jax.jit(mode(rest))
         for rtol, admissible in ((1e-9, 1e-10), (1e-11, 1e-12)):
             np.testing.assert_allclose(slope(jnp.array([12.0, 6.0]), rtol), exact, rtol=admissible)
+
+
+@pytest.mark.parametrize("solver", [dfx.Tsit5(), Rodas5P()])
+def test_derivatives_by_a_start_that_is_almost_at_rest(solver: dfx.AbstractSolver) -> None:
+    m, k, c, t1 = 1.3, 4.0, 0.3, 3.7
+    scene = Scene(lambda t, q, qd, p: 0.5 * m * qd[0] ** 2 - 0.5 * k * q[0] ** 2, {}, (Friction(Viscous(c)),))
+
+    @jax.jit
+    def slopes(x: jax.Array) -> jax.Array:
+        def end(x: jax.Array) -> jax.Array:
+            run = simulate(scene, x[:1], x[1:], t1, solver=solver)
+            return jnp.concatenate([run.q[-1], run.qd[-1]])
+
+        return jax.jacfwd(end)(x)
+
+    exact = jax.scipy.linalg.expm(t1 * jnp.array([[0.0, 1.0], [-k / m, -c / m]]))
+    for size in (1e-18, 1e-14, 1e-10, 1e-6, 1e-3):
+        assert np.abs(slopes(size * jnp.array([1.0, 0.1])) - exact).max() < 5e-6
 
 
 def test_second_derivatives_through_events() -> None:

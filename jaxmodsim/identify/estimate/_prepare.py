@@ -144,7 +144,7 @@ def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str
     base = _bases(scene, several, windows, states, observables)
     engine = _engine(scene, several, options, observables, states.q.shape[1])
     names = (*dict(observables), *(slip_channel(x) for x in dict.fromkeys(e for r in several for e in r.slips)))
-    noise = {name: on_device(_level(name, several)) for name in names}
+    noise = {name: on_device(noise_level(name, several)) for name in names}
     problem = FitProblem(
         engine,
         parameters,
@@ -375,8 +375,13 @@ def _engine(
     )
 
 
-def _level(channel: str, records: tuple[Record, ...]) -> float:
-    """Known noise level, or the standard deviation of the channel to begin with."""
+def noise_level(channel: str, records: tuple[Record, ...]) -> float:
+    """Known noise level, or the standard deviation of the channel to begin with.
+
+    **Raises:**
+
+    - `ValueError` if it differs between the records.
+    """
     known = [record.noise[channel] for record in records if channel in record.noise]
     if known:
         if len(set(known)) > 1:

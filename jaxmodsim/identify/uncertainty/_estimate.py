@@ -24,8 +24,8 @@ BLOCKS = 16
 # Smallest eigenvalue of a scaled normal matrix, relative to the largest one, in units of rounding.
 ROUNDING = 10.0
 
-# A block of samples whose information leaves a determinant below this determines something alone: it has no residual.
-_ALONE = 1e-6
+# A block of samples determines a direction alone if less than this share of its information is in other blocks.
+_ALONE = 0.01
 
 # An offset is reported beyond so many standard errors; share of a constant below which the parameters take it up.
 _BEYOND, _NO_PART = 4.0, 1e-8
@@ -241,15 +241,15 @@ def covariance_estimate(
     size = np.outer(scale, scale)
     bread = floored_inverse(matrix / size, rounding)
     scaled = jacobian / scale
-    scores = np.zeros((count, n))
-    for b in range(count):
-        here = scaled[blocks == b]
-        rest = np.eye(n) - here.T @ here @ bread
-        fair = abs(np.linalg.det(rest)) > _ALONE
-        scores[b] = np.linalg.solve(rest if fair else np.eye(n), here.T @ residual[blocks == b])
-    samples = np.sum(np.any(jacobian != 0, axis=1))
+    shows = np.any(jacobian != 0, axis=1)
+    # Samples of rest have noise, but may show no parameter at all.
+    variance = np.sum(residual**2) / max(np.sum(shows | (residual != 0)) - n, 1)
+    values, vectors = np.linalg.eigh(bread)
+    root = vectors * np.sqrt(values) @ vectors.T
+    own = [np.flatnonzero(shows & (blocks == b)) for b in range(count)]
+    scores = np.concatenate([_block_scores(scaled[rows] @ root, residual[rows], variance) for rows in own])
+    scores = scores @ (vectors / np.sqrt(values) @ vectors.T)
     meat = scores.T @ scores * ((count - 1) / count) + beside / size
-    variance = np.sum(residual**2) / max(samples - n, 1)
     if_white = (matrix - beside) / size * variance + beside / size
     if white:
         meat = meat + _chance(scores, meat - if_white, bread) * (if_white - meat)
@@ -266,6 +266,28 @@ def covariance_estimate(
     known = matrix[first, first] - cross @ floored_inverse(matrix[nuisance, nuisance], rounding) @ cross.T
     information = back.T @ known @ back
     return CovarianceEstimate(of_parameters(bread @ meat @ bread), of_parameters(bread @ if_white @ bread), information)
+
+
+def _block_scores(
+    jacobian: Float[np.ndarray, "rows n"], residual: Float[np.ndarray, " rows"], variance: float
+) -> Float[np.ndarray, "scores n"]:
+    """Scores of a block, corrected for the fit to it, in coordinates in which the whole information is the unit matrix.
+
+    In directions that the block determines alone its score is zero, as its residual is fitted to it. There the scores
+    are those of its parts; a single sample has the `variance` of all residuals.
+    """
+    shares, axes = np.linalg.eigh(jacobian.T @ jacobian)
+    alone = shares > 1 - _ALONE
+    corrected = axes.T @ (jacobian.T @ residual) / np.where(alone, 1.0, 1 - shares)
+    score = (axes[:, ~alone] @ corrected[~alone])[None]
+    if not alone.any():
+        return score
+    only = axes[:, alone]
+    if len(residual) == 1:
+        return np.concatenate([score, np.sqrt(variance) * only.T])
+    parts = np.array_split(np.arange(len(residual)), min(BLOCKS, len(residual)))
+    inner = [_block_scores(jacobian[part], residual[part], variance) for part in parts]
+    return np.concatenate([score, np.concatenate(inner) @ only @ only.T])
 
 
 def _chance(
@@ -450,8 +472,8 @@ def derivatives_hold(problem: FitProblem, state: SearchState) -> bool:
 
 def sample_blocks(problem: FitProblem, blocks: int = BLOCKS) -> tuple[Int[np.ndarray, " rows"], int]:
     """Block of each sample row, and the number of blocks."""
-    weight = next(iter(problem.runs.weight.values()))
-    numbers, count = block_numbers(np.asarray(weight), 1, blocks)
+    weight = np.max(np.stack([np.asarray(each) for each in problem.runs.weight.values()]), axis=0)
+    numbers, count = block_numbers(weight, 1, blocks)
     time = numbers.reshape(problem.count, -1)
     parts = [time] * len(problem.runs.weight)
     for effect in sorted(problem.runs.slips):

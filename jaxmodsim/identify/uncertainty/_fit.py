@@ -19,7 +19,7 @@ from ...scene import Scene, scene_numbers, scene_ranges
 from ..data._record import Record, Windows, cut, runs_of
 from ..data._signals import outliers, sampling_gaps
 from ..estimate._initializers import AbstractInitializer, as_initializers, run_initializers
-from ..estimate._prepare import FitOptions, MultipleShooting, StartState, prepare, step_error
+from ..estimate._prepare import FitOptions, MultipleShooting, StartState, noise_level, prepare, step_error
 from ..estimate._problem import AbstractLoss, FitProblem, Prior, SquaredLoss
 from ..estimate._search import (
     Progress,
@@ -210,7 +210,8 @@ def fit_law(
 
     **Raises:**
 
-    - `ValueError` for unknown names or inputs, or a law that cannot run by itself.
+    - `ValueError` for unknown names or inputs, noise that differs between the records, or a law that cannot run by
+      itself.
 
     **Example:**
 
@@ -239,22 +240,21 @@ def fit_law(
     chosen = _off_limits(single, ranges) if free is None else chosen_entries(numbers, free)
     parameters = FreeParameters.of(single, ranges, chosen)
     windows = cut(several, None)
-    noise = {name: level for each in several for name, level in each.noise.items()}
-    size = float(np.std(np.concatenate([each.measured for each in several]))) or 1.0
+    known = frozenset(name for each in several for name in each.noise)
     problem = FitProblem(
         LawEngine(law),
         parameters,
         (),
         None,
         runs_of(several, windows),
-        {name: on_device(noise.get(name, size)) for name in several[0].channels},
+        {name: on_device(noise_level(name, several)) for name in several[0].channels},
         SquaredLoss() if loss is None else loss,
         Prior.of({}, parameters.names),
     )
     with reported(progress, "fit", iteration_words) as report:
         options = SearchOptions(rtol, as_whole(max_steps, name="max_steps"), report)
         x, starts = run_initializers(initializer, problem, options)
-        search = solve_with_noise(problem, x, options, frozenset(noise))
+        search = solve_with_noise(problem, x, options, known)
     per_load = " per N" if "normal" in several[0].inputs else ""
     units = {
         name: allowed.unit + (per_load if allowed.unit.startswith("N") else "") for name, allowed in ranges.items()
