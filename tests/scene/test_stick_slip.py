@@ -447,3 +447,27 @@ def test_what_starts_at_its_limit_lets_go_at_once(dtype: str) -> None:
         exact = rate * (t1 - units / rate) ** 3 / 6.0
         # Rounding of a load of 9.81 N is 8 units, and delays the least rates by that.
         np.testing.assert_allclose(end(params), np.stack([exact] * dof, 1), rtol=1e-3 if dtype == "float32" else 1e-11)
+
+
+def test_two_blocks_that_let_go_or_turn_together_have_the_derivatives_of_one_after_the_other() -> None:
+    """Equal blocks with a spring between them: the events of both are at one instant, or less than 1e-7 s apart."""
+
+    def lagrangian(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del t, p
+        return 0.5 * jnp.sum(qd**2) - 2.5 * (q[0] - q[1]) ** 2 - jnp.sum(q**2)
+
+    push = jms.AppliedForce(lambda t, q, qd, p: p["a"] * jnp.sin(2.0 * t))
+    law = jms.Coulomb(1.0, Fs=1.4)
+    friction = [jms.Friction(law, along=lambda q, i=i: q[i], name=f"friction_{i}") for i in (0, 1)]
+
+    @jax.jit
+    def end(a: Any, v0: Any) -> Any:
+        scene = jms.Scene(lagrangian, {"a": a}, (push, *friction))
+        return jms.simulate(scene, [0.0, 0.0], v0, 3.0, rtol=1e-11, atol=1e-13, max_events=16).q[-1]
+
+    slopes = jax.jit(jax.jacfwd(end))
+    for v0 in (jnp.zeros(2), jnp.full(2, 0.8)):
+        for apart in (0.0, 1e-9, 1e-7):
+            a = jnp.array([3.0, 3.0 + apart])
+            expected = central_difference(lambda x, a=a, v0=v0: end(a.at[0].set(x), v0), 3.0, 1e-3)
+            np.testing.assert_allclose(slopes(a, v0)[:, 0], expected, atol=1e-5)

@@ -12,7 +12,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from jaxmodsim import EventController, EventSolver, Rodas5P
+from jaxmodsim import EventController, EventSolver, Rodas5P, StoredSteps
 
 G = 9.81
 TS = jnp.linspace(0.0, 2.0, 9)
@@ -363,6 +363,41 @@ def test_batches_with_different_numbers_of_events_do_not_disturb_each_other() ->
         close = 1e-9 if i == 0 else 1e-2
         np.testing.assert_allclose(value[i], alone, rtol=close)
         np.testing.assert_allclose(np.array(gradient)[:, i], np.array(slope), rtol=close)
+
+
+def test_guards_that_fire_together_have_the_derivatives_of_their_own_times() -> None:
+    """Two balls that are dropped from the same height, or nearly, and bounce on their own."""
+    t1 = 0.8
+
+    def after_one(h: Any) -> Any:
+        since = t1 - jnp.sqrt(2 * h / G)
+        return 0.8 * jnp.sqrt(2 * G * h) * since - 0.5 * G * since**2
+
+    def both_bounce(t: Any, s: Any, args: Any, fired: Any) -> Any:
+        return s._replace(y=jnp.where(fired, jnp.stack([0.0 * s.y[0], -0.8 * s.y[1]]), s.y))
+
+    def simulated(h: Any) -> Any:
+        events = EventSolver(dfx.Tsit5(), lambda t, s, args: s.y[0], both_bounce, max_events=4, log=0)
+        solution = dfx.diffeqsolve(
+            dfx.ODETerm(fall),
+            events,
+            0.0,
+            t1,
+            None,
+            events.start(0.0, jnp.stack([h, 0.0 * h])),
+            stepsize_controller=EventController(dfx.PIDController(1e-10, 1e-12)),
+            adjoint=StoredSteps(),
+            max_steps=512,
+        )
+        state: Any = solution.ys
+        return state.y[0, 0], state.events[0]
+
+    apart = jnp.array([0.0, 1e-12, -1e-9, 1e-7])
+    heights = 1.0 + jnp.stack([0.0 * apart, apart], axis=1)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        slopes, events = jax.jit(jax.vmap(derivative(simulated, has_aux=True)))(heights)
+        np.testing.assert_allclose(slopes, jax.vmap(jax.jacfwd(after_one))(heights), rtol=1e-8, atol=1e-8)
+    assert events[0] == 1
 
 
 def test_second_derivatives_pass_through_events() -> None:

@@ -163,9 +163,10 @@ def in_turn(
     if n == 1:
         passage, _, more = way(y, mode, first, fired)
         return passage, more
-    earlier = (ahead[:, None] < ahead) | ((ahead[:, None] == ahead) & (jnp.arange(n)[:, None] < jnp.arange(n)))
+    turns, other = jnp.arange(n)[:, None], jnp.arange(n)[None, :]
+    earlier = (ahead[:, None] < ahead[None, :]) | ((ahead[:, None] == ahead[None, :]) & (turns < other))
     place = jnp.sum(earlier & fired[:, None], axis=0)
-    one = fired & (place == jnp.arange(n)[:, None])
+    one = fired[None, :] & (place[None, :] == turns)
     several = jnp.any(one[1])
     active = jnp.concatenate([jnp.ones(1, bool), jnp.any(one, axis=1) & several])
     nothing = Passage(t, y, (y, mode, y), y, guards), y, (near, near)
