@@ -28,10 +28,11 @@ def peak_of(run: Trajectory, name: str) -> Float[Array, ""]:
     """
     series = find_series(run, name)
     x = read_series(run, series)
-    saved = jnp.max(jnp.where(jnp.isfinite(run.t), jnp.abs(x), 0.0))
+    # Of equal peaks the first counts, with its derivative: `jnp.max` has a mixture of theirs.
+    saved = jax.lax.top_k(jnp.where(jnp.isfinite(run.t), jnp.abs(x), 0.0), 1)[0][0]
     between = _between(run, name)
-    corner = jnp.max(jnp.abs(run.event_sides(series)), initial=0.0)
-    smooth = jnp.maximum(saved, between)
+    corner = jax.lax.top_k(jnp.append(jnp.abs(run.event_sides(series)), 0.0), 1)[0][0]
+    smooth = jnp.where(saved > between, saved, between)
     return jnp.where(corner >= (1.0 - _CORNER) * smooth, corner, smooth)
 
 
@@ -41,7 +42,6 @@ def _between(run: Trajectory, name: str) -> Float[Array, ""]:
     plain = run.request._replace(ts=None).choosing(log=0, audited=False)
     nodes = solve(jax.lax.stop_gradient(plain.choosing(max_steps=_most_steps(run), series=series))).nodes
     assert nodes is not None
-    nodes = jax.lax.stop_gradient(nodes)
     chosen = _largest(nodes)
     start, length = nodes.t[chosen], nodes.t[chosen + 1] - nodes.t[chosen]
     within = jnp.isfinite(length)
@@ -53,7 +53,7 @@ def _between(run: Trajectory, name: str) -> Float[Array, ""]:
     near = plain._replace(ts=jnp.ravel(ts))
     samples = jnp.reshape(read_series(trajectory(near, solve(near)), series), ts.shape)
     samples = jnp.where(within[:, None] & jnp.isfinite(samples), samples, 0.0)
-    return jnp.max(jax.vmap(_vertex)(samples))
+    return jax.lax.top_k(jax.vmap(_vertex)(samples), 1)[0][0]
 
 
 def _most_steps(run: Trajectory) -> int:

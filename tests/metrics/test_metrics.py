@@ -249,6 +249,18 @@ def test_peaks_between_saved_times() -> None:
     np.testing.assert_allclose(slopes, [-2.0 / 1.7, 1.0 / 1.7], rtol=1e-5)
 
 
+def test_of_equal_peaks_one_has_the_derivative():
+    @jax.jit
+    @jax.grad
+    def slope(u: Any) -> Any:
+        pull = jms.Signal([0.0, 0.5, 1.0], u, linear=False)
+        drive = jms.AppliedForce(lambda t, q, qd, p: p["pull"][None], name="drive")
+        scene = jms.Scene(lambda t, q, qd, p: qd[0] ** 2, {"pull": pull}, (drive,))
+        return metrics.peak("drive[0]")(jms.simulate(scene, [0.0], [0.0], 2.0, ts=[0.0, 1.3, 2.0]))
+
+    assert slope(jnp.array([3.0, -1.0, -3.0])).tolist() in ([1.0, 0.0, 0.0], [0.0, 0.0, -1.0])
+
+
 def test_periods_by_crossings() -> None:
     """A swing cos(w t) about any mean has the period 2 pi/w; what dies away or has ended has none."""
     t, run = jnp.linspace(0.0, 40.0, 4001), free()

@@ -107,8 +107,9 @@ class EventSolver(AbstractSolverWrapper):
     **Derivatives.** From the end of the step the state is carried to the root, reset there, and carried back with the
     new field. The way is as short as the landing error, and its derivative is that of the event time: the result
     is the saltation matrix `DR + (f_plus - DR f_minus - D_t R) (x) Dg / (D_t g + Dg f_minus)`, and times in the log are
-    differentiable. Second derivatives hold too, if the adjoint supports them. A guard that touches zero without
-    crossing (grazing) has no derivative.
+    differentiable. Guards that fire together each have the derivative of their own root, if resets one by one lead to
+    the same state; else all have that of the first. Second derivatives hold too, if the adjoint supports them. A
+    guard that touches zero without crossing (grazing) has no derivative.
 
     **Accumulation of events** (a ball that comes to rest, chatter): if the last intervals between events fall below
     1e-3 sqrt(eps) of the time since the start, the run ends with `status = 1` in the state and diffrax's result
