@@ -90,7 +90,7 @@ with _probe(
     from jax.interpreters.ad import UndefinedPrimal as UndefinedPrimal
 
     _need(eqxi, "buffer_at_set create_vprim filter_primitive_bind filter_primitive_def filter_primitive_jvp")
-    _need(eqxi, "filter_primitive_transpose nondifferentiable_backward")
+    _need(eqxi, "filter_primitive_transpose nondifferentiable_backward unvmap_any")
     _need(
         _integrate.State,
         "controller_state dense_infos made_jump num_accepted_steps save_state solver_state tnext tprev y",

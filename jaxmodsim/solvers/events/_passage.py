@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from ..._core.compat import eqxi
+from ..._core.compat import AVAILABLE, eqxi
 from ._state import Landing
 
 # Factor by which the distance to a root in the step and in the passage may differ.
@@ -174,7 +174,8 @@ def in_turn(
     def turn(at: tuple[PyTree, PyTree], marks: tuple[Array, Array, Array, Array]) -> tuple[PyTree, PyTree]:
         first, fires, acts, alone = marks
         # Under vmap, too, a turn without a guard costs nothing.
-        out = jax.lax.cond(eqxi.unvmap_any(acts), lambda: way(*at, first, fires), lambda: nothing)
+        some = eqxi.unvmap_any(acts) if "stored_steps" in AVAILABLE else acts
+        out = jax.lax.cond(some, lambda: way(*at, first, fires), lambda: nothing)
         return choose(acts & alone, (out[0].y, out[0].after[1]), at), out
 
     every = (jnp.concatenate([first[None], one]), jnp.concatenate([fired[None], one]), active, jnp.arange(n + 1) > 0)
