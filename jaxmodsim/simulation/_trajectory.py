@@ -489,7 +489,7 @@ def _events(scene: Scene, log: EventLog) -> tuple[Array, Array, Array, Array]:
         return jnp.where(changed, jnp.ravel(jnp.broadcast_to(x, before.shape)), filler)[order]
 
     return (
-        column(log.t[:, None], jnp.inf),
+        column(log.each[:, np.cumsum([0, *widths[:-1]])], jnp.inf),
         column(indices[None, :], -1),
         column(before.astype(int), -1),
         column(after.astype(int), -1),

@@ -141,7 +141,7 @@ def in_turn(
     at_end: tuple[Array, PyTree, PyTree, Float[Array, " guards"]],
     landing: Landing,
     near: Float[Array, ""],
-) -> tuple[Passage, PyTree]:
+) -> tuple[Passage, Float[Array, " guards"], PyTree]:
     """The event of all guards that fire, the state after it with the derivatives of all their times.
 
     One reset for all of them, at the root of the first, decides. But each of the roots has a derivative of its own. So
@@ -156,13 +156,13 @@ def in_turn(
 
     **Returns:**
 
-    The passage, and the third result of `way`, for all guards at once.
+    The passage; its time for each guard, with the derivative of its own root; and the third result of `way`.
     """
     (t, y, mode, guards), (fired, first, ahead) = at_end, landing[:3]
     n = fired.shape[0]
     if n == 1:
         passage, _, more = way(y, mode, first, fired)
-        return passage, more
+        return passage, passage.t[None], more
     turns, other = jnp.arange(n)[:, None], jnp.arange(n)[None, :]
     earlier = (ahead[:, None] < ahead[None, :]) | ((ahead[:, None] == ahead[None, :]) & (turns < other))
     place = jnp.sum(earlier & fired[:, None], axis=0)
@@ -190,7 +190,10 @@ def in_turn(
 
     far = jtu.tree_leaves(jtu.tree_map(apart, passage.y, y, before, slope, out[0].y, out[0].after[0]))
     far += jtu.tree_leaves(jtu.tree_map(lambda a, b: jnp.any(a != b), now, mode))
-    return passage._replace(y=choose(several & ~jnp.any(jnp.stack(far)), y, passage.y)), more
+    alike = several & ~jnp.any(jnp.stack(far))
+    own = jnp.sum(jnp.where(one, out[0].t[1:, None], 0.0), axis=0)
+    each = jnp.where(alike & fired, _constant(passage.t) + own - _constant(own), passage.t)
+    return passage._replace(y=choose(alike, y, passage.y)), each, more
 
 
 def choose(where: Bool[Array, ""], one: PyTree, other: PyTree) -> PyTree:

@@ -227,8 +227,8 @@ class EventSolver(AbstractSolverWrapper):
             def rows(x: Any) -> Array:
                 return jnp.zeros((entries, *x.shape), x.dtype)
 
-            pair = jtu.tree_map(rows, (y0, mode))
-            log = EventLog(jnp.full(entries, jnp.inf, zero.dtype), rows(guard), pair, pair)
+            pair, each = jtu.tree_map(rows, (y0, mode)), jnp.zeros((entries, *guard.shape), zero.dtype)
+            log = EventLog(jnp.full(entries, jnp.inf, zero.dtype), rows(guard), each, pair, pair)
         return state._replace(fired=jnp.zeros(guard.shape, guard.dtype), log=log)
 
     def _guards(self, t: Real, state: EventState, args: PyTree) -> Float[Array, " guards"]:
@@ -422,7 +422,7 @@ class EventSolver(AbstractSolverWrapper):
             landed = Landed(t, y, mode, first, (level, rate), landing.landed, near, state.t)
             return pass_event(landed, evaluate, (args, back, new_args), reset), slope, (rate, early)
 
-        passage, (rate, early) = in_turn(way, (t, state.y, state.mode, memory.guard), landing, near)
+        passage, each, (rate, early) = in_turn(way, (t, state.y, state.mode, memory.guard), landing, near)
         t_event, values, (y, mode, slope) = passage.t, passage.guards, passage.after
         spread, dense = _spread(t_event, state.t, memory)
         ends = dense & (not self.carries_on)
@@ -441,7 +441,7 @@ class EventSolver(AbstractSolverWrapper):
         if self.carries_on:
             armed = jnp.where(dense, values > 0, armed)
         flags = _flags(fired, values)
-        entry = EventLog(t_event, flags, (passage.before, state.mode), (y, mode))
+        entry = EventLog(t_event, flags, each, (passage.before, state.mode), (y, mode))
         log = None if state.log is None else jtu.tree_map(lambda a, b: write(a, index, b), state.log, entry)
         passed = state._replace(y=passage.y, mode=mode), memory._replace(guard=_constant(values), armed=armed)
         after_reset = (

@@ -15,11 +15,13 @@ class EventLog(NamedTuple):
 
     - `t`: times [s], shape `[max_events]`.
     - `fired`: 1 for each guard that fired, shape `[max_events, guards]`.
+    - `each`: the same times for each guard, with the derivative of its own root, shape `[max_events, guards]`.
     - `before`, `after`: the pair (y, mode) at the event before and after the reset, with a leading axis `max_events`.
     """
 
     t: Float[Array, "*s events"]
     fired: Float[Array, "*s events guards"]
+    each: Float[Array, "*s events guards"]
     before: tuple[PyTree, PyTree]
     after: tuple[PyTree, PyTree]
 
