@@ -284,7 +284,7 @@ class _StatementWriter(AbstractScalars):
             x = slices[0]
             for k in range(1, last + 1):
                 beyond = self.apply(jax.lax.ge, "ge", {}, [at, at.dtype.type(k)])
-                x = self.choose(_scalar_array(beyond), slices[k], x)
+                x = self.choose(self.parts(beyond), slices[k], x)
         return x
 
     def scatter_add(self, eqn: JaxprEqn, x: Parts, updates: Parts, places: np.ndarray) -> Parts:
@@ -319,7 +319,9 @@ class _StatementWriter(AbstractScalars):
         with self.inner_block() as head:
             # Under vmap one condition for each member, whose variables change while its own condition is true.
             conditions = self.parts(self.run(test.jaxpr, test.consts, [*test_consts, *symbols])[0])
-            condition = functools.reduce(lambda a, b: self.apply(jax.lax.bitwise_or, "or", {}, [a, b]), conditions.flat)
+            either: Any = functools.reduce(
+                lambda a, b: self.apply(jax.lax.bitwise_or, "or", {}, [a, b]), conditions.flat
+            )
             self.block = []
             after = [self.parts(x) for x in self.run(body.jaxpr, body.consts, [*body_consts, *symbols])]
             changed = [
@@ -332,7 +334,7 @@ class _StatementWriter(AbstractScalars):
                 flat = [x for parts in held for x in parts.flat]
                 carries = [carry._replace(after=x) for carry, x in zip(carries, flat, strict=True)]
             inside = self.block
-        self.block.append(Loop(bound, carries, head, condition, inside))
+        self.block.append(Loop(bound, carries, head, either, inside))
         return list(symbols)
 
     def scan(self, params: Params, inputs: list[Value]) -> list[Value]:

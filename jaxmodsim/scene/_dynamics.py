@@ -277,7 +277,7 @@ class Dynamics(NamedTuple):
         if not any(load in contacts for load in loads):
             return mode
         elements, closed = self.friction_elements, jnp.ones_like(self.t)
-        free = jnp.stack([contacts.get(load, closed) == 0 for load in loads])
+        free = jnp.stack([contacts.get(load or "", closed) == 0 for load in loads])
         v = jax.lax.stop_gradient(elements.v[: mode.size])
         return jnp.where(elements.in_rows(free) & (mode == 0), jnp.where(v < 0, -1.0, jnp.ones_like(v)), mode)
 

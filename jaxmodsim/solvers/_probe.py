@@ -60,7 +60,7 @@ def direction(step: PyTree, y0: PyTree, asked: tuple[PyTree, PyTree], controller
     rng, control = np.random.default_rng(35), _pid(controller)[0]
     resolved = lax.stop_gradient(control.atol / (control.atol + control.rtol))
 
-    def change(least: Array | float, is_asked: Any, x: Any) -> Any:
+    def change(least: Any, is_asked: Any, x: Any) -> Any:
         if is_asked is None:
             return None
         part = np.exp(rng.uniform(-0.7, 0.7, x.shape)) * rng.choice((-1.0, 1.0), x.shape)
