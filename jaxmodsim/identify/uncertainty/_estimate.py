@@ -239,33 +239,32 @@ def covariance_estimate(
     silent = scale == 0
     scale = np.where(silent, 1.0, scale)
     size = np.outer(scale, scale)
-    bread = floored_inverse(matrix / size, rounding)
-    scaled = jacobian / scale
+    # Coordinates in which the information is the unit matrix; sums of squares, so that no variance is below zero.
+    values, vectors = np.linalg.eigh(matrix / size)
+    root = vectors / np.sqrt(np.maximum(values, rounding * max(values[-1], 1.0))) @ vectors.T
+    rows, others = jacobian / scale @ root, extra / scale @ root
     shows = np.any(jacobian != 0, axis=1)
     # Samples of rest have noise, but may show no parameter at all.
     variance = np.sum(residual**2) / max(np.sum(shows | (residual != 0)) - n, 1)
-    values, vectors = np.linalg.eigh(bread)
-    root = vectors * np.sqrt(values) @ vectors.T
     own = [np.flatnonzero(shows & (blocks == b)) for b in range(count)]
-    scores = np.concatenate([_block_scores(scaled[rows] @ root, residual[rows], variance) for rows in own])
-    scores = scores @ (vectors / np.sqrt(values) @ vectors.T)
-    meat = scores.T @ scores * ((count - 1) / count) + beside / size
-    if_white = (matrix - beside) / size * variance + beside / size
-    if white:
-        meat = meat + _chance(scores, meat - if_white, bread) * (if_white - meat)
-    change = slopes / scale
+    scores = np.concatenate([_block_scores(rows[here], residual[here], variance) for here in own])
+    noise, fair = np.sqrt(variance) * rows, (count - 1) / count
+    share = _chance(scores, fair * scores.T @ scores - noise.T @ noise) if white else 0.0
+    change = slopes / scale @ root
 
     first, nuisance = slice(parameters), slice(parameters, None)
 
-    def of_parameters(middle: np.ndarray) -> np.ndarray:
-        covariance = (change @ middle @ change.T)[first, first]
+    def of_parameters(*parts: np.ndarray) -> np.ndarray:
+        moved = np.concatenate(parts) @ change[first].T
+        covariance = moved.T @ moved
         np.fill_diagonal(covariance, np.where(silent[first], np.inf, np.diagonal(covariance)))
         return covariance
 
     back, cross = np.linalg.pinv(slopes[first, first]), matrix[first, nuisance]
     known = matrix[first, first] - cross @ floored_inverse(matrix[nuisance, nuisance], rounding) @ cross.T
     information = back.T @ known @ back
-    return CovarianceEstimate(of_parameters(bread @ meat @ bread), of_parameters(bread @ if_white @ bread), information)
+    whole = of_parameters(np.sqrt(fair * (1 - share)) * scores, np.sqrt(share) * noise, others)
+    return CovarianceEstimate(whole, of_parameters(noise, others), information)
 
 
 def _block_scores(
@@ -290,17 +289,11 @@ def _block_scores(
     return np.concatenate([score, np.concatenate(inner) @ only @ only.T])
 
 
-def _chance(
-    scores: Float[np.ndarray, "blocks n"], difference: Float[np.ndarray, "n n"], bread: Float[np.ndarray, "n n"]
-) -> float:
-    """Share of a squared difference of S that chance explains; 0 if a direction is not determined."""
-    try:
-        root = np.linalg.cholesky(bread)
-    except np.linalg.LinAlgError:
-        return 0.0
-    products = np.einsum("bi,bj->bij", scores @ root, scores @ root)
+def _chance(scores: Float[np.ndarray, "scores n"], difference: Float[np.ndarray, "n n"]) -> float:
+    """Share of a squared difference of S that chance explains, in coordinates of unit information."""
+    products = np.einsum("bi,bj->bij", scores, scores)
     chance = np.sum((products - np.mean(products, axis=0)) ** 2)
-    share = chance / max(float(np.sum((root.T @ difference @ root) ** 2)), _TINY)
+    share = chance / max(float(np.sum(difference**2)), _TINY)
     return min(float(share), 1.0) if np.isfinite(share) else 0.0
 
 
