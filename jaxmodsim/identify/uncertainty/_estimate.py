@@ -235,14 +235,10 @@ def covariance_estimate(
     n = jacobian.shape[1]
     beside = extra.T @ extra
     matrix = jacobian.T @ jacobian + beside
-    scale = np.sqrt(np.diagonal(matrix))
-    silent = scale == 0
-    scale = np.where(silent, 1.0, scale)
-    size = np.outer(scale, scale)
+    silent = np.diagonal(matrix) == 0
     # Coordinates in which the information is the unit matrix; sums of squares, so that no variance is below zero.
-    values, vectors = np.linalg.eigh(matrix / size)
-    root = vectors / np.sqrt(np.maximum(values, rounding * max(values[-1], 1.0))) @ vectors.T
-    rows, others = jacobian / scale @ root, extra / scale @ root
+    root = _floored_root(matrix, rounding)
+    rows, others = jacobian @ root, extra @ root
     shows = np.any(jacobian != 0, axis=1)
     # Samples of rest have noise, but may show no parameter at all.
     variance = np.sum(residual**2) / max(np.sum(shows | (residual != 0)) - n, 1)
@@ -250,7 +246,7 @@ def covariance_estimate(
     scores = np.concatenate([_block_scores(rows[here], residual[here], variance) for here in own])
     noise, fair = np.sqrt(variance) * rows, (count - 1) / count
     share = _chance(scores, fair * scores.T @ scores - noise.T @ noise) if white else 0.0
-    change = slopes / scale @ root
+    change = slopes @ root
 
     first, nuisance = slice(parameters), slice(parameters, None)
 
@@ -307,12 +303,18 @@ def floored_inverse(matrix: Float[np.ndarray, "n n"], least: float) -> Float[np.
     - `matrix`: symmetric, shape `[n, n]`. A column of zeros counts as one of unit length.
     - `least`: smallest eigenvalue, as a share of the largest one.
     """
+    root = _floored_root(matrix, least)
+    return root @ root.T
+
+
+def _floored_root(matrix: Float[np.ndarray, "n n"], least: float) -> Float[np.ndarray, "n n"]:
+    """R with `R R'` the `floored_inverse` of the matrix."""
     if not matrix.size:
         return matrix
     scale = np.sqrt(np.diagonal(matrix))
-    size = np.multiply.outer(*[np.where(scale > 0, scale, 1.0)] * 2)
-    values, vectors = np.linalg.eigh(matrix / size)
-    return vectors / np.maximum(values, least * max(values[-1], 1.0)) @ vectors.T / size
+    scale = np.where(scale > 0, scale, 1.0)
+    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
+    return vectors / np.sqrt(np.maximum(values, least * max(values[-1], 1.0))) / scale[:, None]
 
 
 def correlation_of(covariance: Float[np.ndarray, "free free"]) -> Float[np.ndarray, "free free"]:
