@@ -82,10 +82,9 @@ class Geared(AbstractSetValuedLaw):
 
     def _per_torque(self, side: Scalar, of: Callable[[AbstractSetValuedLaw], Scalar]) -> Scalar:
         """`|tau|` times `of(drive)` or `of(back)`, for slip towards `side` (+1 or -1)."""
-        driven = of(self.drive)
-        if self.back is not None:
-            driven = jnp.where(side * self.torque >= 0, driven, of(self.back))
-        return jnp.abs(self.torque) * driven
+        power, drive = side * self.torque, of(self.drive)
+        back = drive if self.back is None else of(self.back)
+        return jnp.where(power >= 0, power * drive, -power * back)
 
     def sliding_force(self, v: Scalar) -> Scalar:
         """Magnitude [N] of the dry part in slip."""
@@ -236,16 +235,22 @@ class ServoGear(AbstractSetValuedLaw):
             )
         return cls(motor, external, **sets[actuator][model])
 
+    def _difference(self, by_motor: Scalar, by_external: Scalar) -> Scalar:
+        """`|by_motor tau_m - by_external tau_e|`, at zero with derivatives of one side: of growing coefficients."""
+        torque = by_motor * self.motor - by_external * self.external
+        side = jnp.where(torque == 0, self.motor - self.external, torque)
+        return jnp.where(side >= 0, torque, -torque)
+
     def _constant(self) -> Scalar:
         """Dry part at any speed [N m]."""
-        return self.Kc + jnp.abs(self.Km * self.motor - _or(self.Ke, self.Km) * self.external)
+        return self.Kc + self._difference(self.Km, _or(self.Ke, self.Km))
 
     def _falling(self) -> Scalar:
         """Stribeck part at rest [N m], which falls with speed."""
         motor, external = self.motor, self.external
         larger = jnp.abs(motor) > jnp.abs(external)
         quadratic = jnp.where(larger, _or(self.Keq, self.Kmq) * external**2, self.Kmq * motor**2)
-        linear = self.Kcs + jnp.abs(self.Kms * motor - _or(self.Kes, self.Kms) * external)
+        linear = self.Kcs + self._difference(self.Kms, _or(self.Kes, self.Kms))
         return linear + jnp.where(motor * external < 0, quadratic, 0.0)
 
     def sliding_force(self, v: Scalar) -> Scalar:

@@ -318,6 +318,28 @@ def test_derivatives_of_the_richest_model_equal_differences() -> None:
             assert float(getattr(slopes, name)) == pytest.approx(float(difference), abs=1e-8)
 
 
+@pytest.mark.parametrize("slip", [1.0, -1.0])
+def test_a_torque_of_zero_has_the_derivative_of_one_side(slip: float) -> None:
+    v, zero = jnp.array(slip), jnp.array(0.0)
+    laws: dict[str, tuple[Any, set[float]]] = {
+        "one coefficient": (lambda torque: Geared(Coulomb(0.1), DRIVE, torque), {DRIVE, -DRIVE}),
+        "two": (lambda torque: Geared(Coulomb(0.1), DRIVE, torque, BACK), {slip * DRIVE, -slip * BACK}),
+        "servo": (lambda torque: ServoGear(torque, 0.0, Kc=0.1, Kv=0.0, Km=DRIVE), {DRIVE, -DRIVE}),
+    }
+    for name, (make, sides) in laws.items():
+        slope = float(jax.grad(lambda torque, make=make: make(torque).sliding_force(v))(zero))
+        assert slope in sides, name
+
+
+@pytest.mark.parametrize("torques", [(1.3, -0.8), (-1.3, 0.8)])
+def test_coefficients_of_zero_have_the_derivative_of_growth(torques: tuple[float, float]) -> None:
+    def force(coefficients: Any) -> Any:
+        Km, Ke = coefficients
+        return ServoGear(*torques, Kc=0.1, Kv=0.0, Km=Km, Ke=Ke).sliding_force(jnp.array(1.0))
+
+    np.testing.assert_allclose(jax.grad(force)(jnp.zeros(2)), np.abs(torques), rtol=1e-15)
+
+
 def test_wrong_published_names_are_refused() -> None:
     with pytest.raises(ValueError, match=r"actuators mx64, mx106, .* models M1, .* but 'mx64' and 'M7' were given"):
         ServoGear.published("mx64", "M7", 1.0, 1.0)
