@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.special import ndtri
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from .._core.arrays import Scalar
+from .._core.arrays import Scalar, is_known
 from ..export import function_to_c
 from ..scene import (
     Scene,
@@ -212,11 +212,16 @@ class FrictionFilter(eqx.Module):
 
         **Raises:**
 
-        - `ValueError` for an unknown name.
+        - `ValueError` for an unknown name, and a number of zero that is estimated as a logarithm.
         """
         kind = self._zero.q.dtype
         y = State(jnp.asarray(q, kind), jnp.asarray(qd, kind), self._zero.z)
         values = [jnp.asarray(read_element(self.scene, name), kind) for name in self.numbers]
+        for name, x in zip(self.numbers, values, strict=True):
+            if _is_positive(self.scene, name) and is_known(x) and not x > 0:
+                raise ValueError(
+                    f"FrictionFilter estimates the logarithm of {name}, which starts at {x}: start above 0."
+                )
         values = [
             jnp.log(x) if _is_positive(self.scene, name) else x for name, x in zip(self.numbers, values, strict=True)
         ]
@@ -270,7 +275,7 @@ class FrictionFilter(eqx.Module):
 
         **Raises:**
 
-        - `ValueError` for arrays that do not match, and unknown inputs.
+        - `ValueError` for arrays that do not match, times that do not increase, and unknown or estimated inputs.
         """
         kind = self._zero.q.dtype
         t, measured = jnp.asarray(t, kind), jnp.asarray(measured, kind)
@@ -282,6 +287,10 @@ class FrictionFilter(eqx.Module):
             raise ValueError(f"FrictionFilter.run: {name} has shape {shapes[name]}, but {wanted[name]} is needed.")
         if unknown := [name for name in inputs if name not in elements(self.scene)]:
             raise ValueError(f"FrictionFilter.run: the scene has no number {unknown[0]!r} for an input.")
+        if both := [name for name in inputs if name in self.numbers]:
+            raise ValueError(f"FrictionFilter.run: {both[0]!r} is estimated, so it cannot be an input.")
+        if is_known(t) and np.any(np.diff(np.asarray(t)) < 0):
+            raise ValueError("FrictionFilter.run: t decreases, but times must increase.")
         return _run(self, t, measured, inputs, start)
 
     def to_c(self, name: str, inputs: Sequence[str] = ()) -> str:

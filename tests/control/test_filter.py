@@ -165,6 +165,13 @@ def test_errors_name_what_is_wrong():
         filter.run(t, t, {}, filter.start([0.0], [0.0], {}))
     with pytest.raises(ValueError, match="no number 'w'"):
         filter.run(t, t[:, None], {"w": t}, filter.start([0.0], [0.0], {}))
+    with pytest.raises(ValueError, match=r"'friction\.normal_force' is estimated"):
+        filter.run(t, t[:, None], {LEVEL: t}, filter.start([0.0], [0.0], {}))
+    with pytest.raises(ValueError, match="t decreases"):
+        filter.run(-t, t[:, None], {}, filter.start([0.0], [0.0], {}))
+    viscous = FrictionFilter(axis(jms.Viscous(0.0)), 1e-5, {}, numbers=("friction.Fv",))
+    with pytest.raises(ValueError, match=r"logarithm of friction\.Fv, which starts at 0\.0"):
+        viscous.start([0.0], [0.0], {"friction.Fv": 1.0})
 
 
 @pytest.mark.skipif(COMPILER is None or "jaxprs" not in AVAILABLE, reason="needs a C compiler and traced programs")
