@@ -220,10 +220,19 @@ fmi3Status fmi3SetFloat64(fmi3Instance instance, REFERENCES, const fmi3Float64 v
   return fmi3OK;
 }
 
-/* Rates, guards and outputs at the present state. */
+/* The state with which the motion goes on: modes are decided when the initialization or a change between steps ends. */
+static State present(const Instance *c) {
+  State s = c->motion.s;
+  if (s.phase == INITIALIZATION || (s.phase == STEP_MODE && s.changed)) {
+    model_start(s.t, s.numbers, c->motion.tolerances, s.y, s.mode);
+  }
+  return s;
+}
+
+/* Rates, guards and outputs there. */
 static void evaluate(Instance *c) {
-  const State *s = &c->motion.s;
-  model_evaluate(s->t, s->numbers, s->y, s->mode, c->motion.tolerances, c->evaluated);
+  const State s = present(c);
+  model_evaluate(s.t, s.numbers, s.y, s.mode, c->motion.tolerances, c->evaluated);
 }
 
 fmi3Status fmi3GetFloat64(fmi3Instance instance, REFERENCES, fmi3Float64 values[], size_t nValues) {
@@ -245,15 +254,15 @@ fmi3Status fmi3GetFloat64(fmi3Instance instance, REFERENCES, fmi3Float64 values[
 
 fmi3Status fmi3GetInt32(fmi3Instance instance, REFERENCES, fmi3Int32 values[], size_t nValues) {
   SELF;
-  STATE;
+  const State s = present(c);
   if (nValues != nReferences) return fail(c, "get: one value for each variable is needed");
   for (size_t i = 0; i < nValues; ++i) {
     const fmi3ValueReference r = references[i];
     if (r < FIRST_MODE || r >= END) return no_variable(c, "get Int32", r);
     const int start = model_modes[r - FIRST_MODE], stop = model_modes[r - FIRST_MODE + 1];
-    values[i] = (fmi3Int32)s->mode[start];
-    for (int k = start; k < stop && stop > start + 1; ++k) values[i] = k == start ? s->mode[k] != 0.0
-                                                                                  : values[i] || s->mode[k] != 0.0;
+    values[i] = (fmi3Int32)s.mode[start];
+    for (int k = start; k < stop && stop > start + 1; ++k) values[i] = k == start ? s.mode[k] != 0.0
+                                                                                  : values[i] || s.mode[k] != 0.0;
   }
   return fmi3OK;
 }
@@ -371,10 +380,10 @@ static bool inside(const fmi3ValueReference references[], size_t n, fmi3ValueRef
 
 fmi3Status fmi3GetDirectionalDerivative(DERIVATIVE) {
   SELF;
-  STATE;
+  const State s = present(c);
   CHECK_DERIVATIVE(nKnowns, nUnknowns);
   for (size_t i = 0; i < nKnowns; ++i) c->seed[knowns[i]] += seed[i];
-  model_push(s->t, s->numbers, s->y, s->mode, c->motion.tolerances, c->seed[0], c->seed + FIRST_NUMBER,
+  model_push(s.t, s.numbers, s.y, s.mode, c->motion.tolerances, c->seed[0], c->seed + FIRST_NUMBER,
              c->seed + FIRST_STATE, c->evaluated);
   for (size_t i = 0; i < nUnknowns; ++i) {
     const fmi3ValueReference r = unknowns[i];
@@ -385,14 +394,14 @@ fmi3Status fmi3GetDirectionalDerivative(DERIVATIVE) {
 
 fmi3Status fmi3GetAdjointDerivative(DERIVATIVE) {
   SELF;
-  STATE;
+  const State s = present(c);
   double direct[STATES] = {0.0};
   CHECK_DERIVATIVE(nUnknowns, nKnowns);
   for (size_t i = 0; i < nUnknowns; ++i) {
     const fmi3ValueReference r = unknowns[i];
     *(r < FIRST_EVALUATED ? &direct[r - FIRST_STATE] : &c->evaluated[r - FIRST_EVALUATED]) += seed[i];
   }
-  model_pull(s->t, s->numbers, s->y, s->mode, c->motion.tolerances, c->evaluated, c->seed);
+  model_pull(s.t, s.numbers, s.y, s.mode, c->motion.tolerances, c->evaluated, c->seed);
   for (int i = 0; i < STATES; ++i) c->seed[FIRST_STATE + i] += direct[i];
   for (size_t i = 0; i < nKnowns; ++i) sensitivity[i] = c->seed[knowns[i]];
   return fmi3OK;

@@ -175,12 +175,13 @@ static double above(const double g[3 * MODES], int i) { return g[i] - g[2 * MODE
 
 /* The root of guard i between the fractions `low`, where it is positive, and `high`, by the Illinois method. */
 static double root_between(const Motion *c, double h, int i, double low, double high) {
+  const double shortest = DBL_EPSILON * high;
   double g[3 * MODES], a, b;
   int side = 0;
   guards_at(c, h, low, g), a = above(g, i);
   for (double part = high; a <= 0.0; a = above(g, i)) {
     part *= 0.5;
-    if (low > 0.0 || part < 1e-9 * high) return low;
+    if (low > 0.0 || part < shortest) return low;
     guards_at(c, h, part, g);
     if (above(g, i) > 0.0) low = part;
     else high = part;

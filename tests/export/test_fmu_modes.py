@@ -1,0 +1,62 @@
+"""Modes of an FMU before its first step, after changes between steps, and after a jump of a load."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import jaxmodsim as jms
+from jaxmodsim._core.compat import AVAILABLE
+from jaxmodsim.export import _compile
+
+OWN = _compile.own_platform()
+needs_fmpy = pytest.mark.skipif(
+    "jaxprs" not in AVAILABLE or _compile.compiler_of(OWN) is None,
+    reason="needs the programs that JAX traces, and a C compiler: ziglang, cc, gcc or clang",
+)
+fmpy = pytest.importorskip("fmpy", reason="needs FMPy, which runs FMUs")
+
+
+@needs_fmpy
+def test_modes_are_decided_before_the_first_step_and_after_a_jump_of_a_load(tmp_path: Path) -> None:
+    from fmpy.fmi3 import FMU3Slave
+
+    scene = jms.Scene(
+        lambda t, q, qd, p: 0.5 * p["m"] * qd[0] ** 2,
+        {"m": 1.0, "pull": 0.0},
+        (
+            jms.AppliedForce(lambda t, q, qd, p: (p["pull"] - t)[None], name="motor"),
+            jms.Friction(jms.Coulomb(1.0, 1.5)),
+        ),
+    )
+    path = jms.export.fmu(
+        scene, [0.0], [0.3], tmp_path / "cart.fmu", inputs=["pull", "friction.belt_velocity"], platforms=[OWN]
+    )
+    description = fmpy.read_model_description(str(path))
+    place = {each.name: each.valueReference for each in description.modelVariables}
+    one = FMU3Slave(
+        guid=description.guid, unzipDirectory=fmpy.extract(str(path), str(tmp_path / "cart")),
+        modelIdentifier="cart", instanceName="one",
+    )  # fmt: skip
+
+    def check(force: float, rate: float) -> None:
+        assert one.getFloat64([place["friction"], place["der(qd[0])"]]) == pytest.approx([force, rate])
+        assert one.getInt32([place["friction.mode"]]) == [np.sign(force)]
+        by = [place["der(qd[0])"]], [place["friction.Fc"]]
+        assert one.getDirectionalDerivative(*by, [1.0]) == one.getAdjointDerivative(*by, [1.0]) == [-np.sign(force)]
+
+    one.instantiate()
+    one.enterInitializationMode(tolerance=1e-6, startTime=0.0)
+    check(1.0, -1.0)
+    one.exitInitializationMode()
+    check(1.0, -1.0)
+    one.setFloat64([place["friction.belt_velocity"]], [1.0])
+    check(-1.0, 1.0)
+    one.setFloat64([place["friction.belt_velocity"]], [0.0])
+    one.doStep(0.0, 0.5)
+    assert one.getFloat64([place["qd[0]"]]) == [0.0]
+    # The load jumps beyond break-away, and falls while friction still sticks.
+    one.setFloat64([place["pull"]], [5.0])
+    one.doStep(0.5, 0.5)
+    assert one.getFloat64([place["qd[0]"]]) == pytest.approx([1.625])
+    one.freeInstance()
