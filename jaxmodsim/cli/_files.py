@@ -72,6 +72,11 @@ def _csv(path: Path) -> Columns:
     except (ValueError, pd.errors.ParserError) as error:
         raise ValueError(f"{path} is not a CSV file with a header line: {_one_line(error)}") from error
     names = [str(name).strip() for name in frame.columns]
+    if not isinstance(frame.index, pd.RangeIndex):  # pandas takes the first cells of longer rows as labels
+        if frame.index.nlevels > 1 or frame.iloc[:, -1].notna().any():
+            cells = len(names) + frame.index.nlevels
+            raise ValueError(f"{path.name}: rows have {cells} cells, but the header names {len(names)} columns.")
+        frame = frame.reset_index()  # every row ends with a separator
     if names and all(_POINT_NUMBER.fullmatch(name) for name in names):
         raise ValueError(
             f"{path} is not a CSV file with a header line: the first line holds numbers. Add the names of the columns"

@@ -36,6 +36,7 @@ _DRIVE = ("current", "voltage")
 # At the end of a name without brackets, these often mean something else: q_m, F_min, u_in.
 _AMBIGUOUS = ("m", "in", "min", "h", "rev")
 _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)?\s*(.*?)\s*\Z", re.DOTALL)
+_UNKNOWN = re.compile(r"\[[^\[\]]*[^\W\d][^\[\]]*\]\s*\Z")
 _IN_BRACKETS = re.compile(r"(.*?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))\s*\Z", re.DOTALL)
 
 
@@ -151,7 +152,9 @@ def column_unit(role: str, header: str, option: Unit | None) -> tuple[Unit, str]
     in_header = split_header(header)[1]
     if option is None:
         if in_header is None:
-            return Unit(1.0, None, ""), ""
+            unknown = _UNKNOWN.search(header)
+            note = unknown and f"{header!r}: {unknown[0]} is no known unit, so SI is assumed; give --units {role}=UNIT."
+            return Unit(1.0, None, ""), note or ""
         if role == "force" and in_header.quantity in _DRIVE:
             raise ValueError(f"column {header!r}: {_drive_sentence(in_header)}")
         if in_header.quantity not in _ROLES[role]:

@@ -136,6 +136,25 @@ def test_separators_are_told_from_the_text(tmp_path, sep, decimal):
     np.testing.assert_allclose(record.inputs["u"], GAIN * U, rtol=1e-12)
 
 
+@pytest.mark.parametrize(("sep", "decimal"), [(",", "."), (";", ",")])
+def test_rows_that_end_with_a_separator_keep_their_columns(tmp_path, sep, decimal):
+    path = written(tmp_path, FRAME.assign(temperature=25.0), sep, decimal)
+    header, *rows = path.read_text().splitlines()
+    path.write_text("\n".join([header, *(row + sep for row in rows)]))
+    (record,) = read_record(path, names()).parts
+    np.testing.assert_allclose(record.t, T, rtol=1e-12)
+    np.testing.assert_allclose(record.inputs["u"], GAIN * U, rtol=1e-12)
+    path.write_text("\n".join([header, *(f"{row}{sep}7" for row in rows)]))
+    with pytest.raises(ValueError, match=r"rows have 5 cells, but the header names 4 columns"):
+        read_record(path, names())
+
+
+def test_an_unknown_unit_is_named(tmp_path):
+    path = written(tmp_path, FRAME.rename(columns={"pos": "pos [inch]"}))
+    (note,) = read_record(path, AxisColumns("time", "pos [inch]", "volt", parse_units([f"force={GAIN}"]))).notes
+    assert note == "run: 'pos [inch]': [inch] is no known unit, so SI is assumed; give --units position=UNIT."
+
+
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "latin-1"])
 def test_signs_of_units_are_read_in_any_encoding(tmp_path, encoding):
     path = written(tmp_path, FRAME.rename(columns={"pos": "pos [°]", "time": "time [µs]"}), encoding=encoding)
