@@ -193,7 +193,8 @@ def _solve_one(fn: Callable[[Array], Array], free: Array, coupling: Array, block
 
     def residual(size: Array) -> tuple[Array, Array]:
         push = a * fn((side * size)[None])[0]
-        small = _ROUNDING * eps * (size + jnp.abs(free0) + jnp.abs(push))
+        # Below the normal numbers rounding is absolute.
+        small = _ROUNDING * eps * (size + jnp.abs(free0) + jnp.abs(push)) + tiny
         return size + side * (push - free0), small
 
     never = jnp.full_like(free0, jnp.inf)
@@ -216,27 +217,27 @@ def _solve_several(fn: Callable[[Array], Array], free: Array, coupling: Array, b
 
     That derivative is `s.(p(x) - push)`. It also determines the length if p has no potential or decreases.
     """
-    eps = float(jnp.finfo(free.dtype).eps)
+    eps, tiny = float(jnp.finfo(free.dtype).eps), float(jnp.finfo(free.dtype).tiny)
 
     def iterate(s: _RootIterate) -> _RootIterate:
         value, slopes = _slopes(fn, s.x, blocks)
         residual = s.x - free + apply_matrix(coupling, value)
         size = jnp.abs(value) + apply_matrix(jnp.abs(slopes), jnp.abs(s.x))
         scale = jnp.abs(s.x) + jnp.abs(free) + apply_matrix(jnp.abs(coupling), size)
-        misfit = jnp.max(jnp.abs(residual) / jnp.where(scale > 0, eps * scale, 1.0))
+        misfit = jnp.max(jnp.abs(residual) / (eps * scale + tiny))
         # If p decreases, Newton steps may cycle; those of an increasing model do not.
         slopes = jnp.where(s.tries < _PATIENCE, slopes, _increasing(slopes))
         step = _newton(coupling, slopes, residual)
         change = value - s.push + apply_matrix(slopes, step)
-        descends = jnp.sum(step * (value - s.push)) < 0
+        # Products with a step underflow, unless it is in units of its largest entry.
+        descends = jnp.sum(step / jnp.maximum(jnp.max(jnp.abs(step)), tiny) * (value - s.push)) < 0
         step = jnp.where(descends, step, -residual)
         change = jnp.where(descends, change, value - s.push)
         still = jnp.all(jnp.abs(step) <= eps * jnp.abs(s.x))
         # The rounding error of p is unknown: close to the solution the search ends when progress stops.
         ends = (misfit <= _LOST) & (misfit >= 0.5 * s.misfit)
         settled = (misfit <= _ROUNDING) | still | ends
-        first = jnp.sum(step * (value - s.push))
-        length = _length(fn, s.x, s.push, step, change, blocks, first, settled)
+        length = _length(fn, s.x, s.push, step, change, blocks, value - s.push, settled)
         # Blocks of several unknowns may have no potential; shorter steps then end their cycles.
         short = (s.tries >= 2 * _PATIENCE) & (s.tries % 3 == 0)
         length = jnp.where(settled, 0.0, jnp.where(short, 0.5, 1.0) * length)
@@ -266,18 +267,20 @@ def _length(
     first: Array,
     settled: Array,
 ) -> Array:
-    """Length of a Newton step, at most 1; the derivative along it begins with `first` < 0. 1 if `settled`."""
+    """Length of a Newton step, at most 1; `first` is `p(x) - push` at its beginning. 1 if `settled`."""
+    largest = jnp.maximum(jnp.max(jnp.abs(step)), float(jnp.finfo(x.dtype).tiny))
+    towards = step / largest
 
     def along(length: ArrayLike) -> Array:
-        return jnp.sum(step * (fn(x + length * step) - push - length * change))
+        return jnp.sum(towards * (fn(x + length * step) - push - length * change))
 
-    eps, one = float(jnp.finfo(x.dtype).eps), jnp.ones_like(first)
-    enough = -_ENOUGH * first
+    eps, one = float(jnp.finfo(x.dtype).eps), jnp.ones_like(largest)
+    enough = -_ENOUGH * jnp.sum(towards * first)
     kinks, start = [], 0
     for size in blocks:
         part = slice(start, start + size)
-        square = jnp.sum(step[part] * step[part])
-        kinks.append(-jnp.sum(x[part] * step[part]) / jnp.where(square > 0, square, 1.0))
+        square = jnp.sum(towards[part] * towards[part])
+        kinks.append(-jnp.sum(x[part] / largest * towards[part]) / jnp.where(square > 0, square, 1.0))
         start += size
     places = jnp.stack(kinks)
     between = (places > 0) & (places < 1)

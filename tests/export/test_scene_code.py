@@ -271,6 +271,18 @@ def test_steps_end_whatever_they_are_given(in_c: Callable[[str], InC]) -> None:
 
 
 @needs_compiler
+@pytest.mark.parametrize("dof", [1, 2])
+def test_steps_are_solved_while_a_velocity_decays_below_the_normal_numbers(dof: int, tmp_path: Path) -> None:
+    law = jms.Regularized(jms.Coulomb(1.5), 1e-3)
+    effects = tuple(jms.Friction(law, along=lambda q, i=i: q[i] - (q[i - 1] if i else 0.0)) for i in range(dof))
+    scene = jms.Scene(lambda t, q, qd, p: 0.5 * p["m"] * jnp.sum(qd**2), {"m": 2.0}, effects)
+    start = np.concatenate([np.zeros(dof), np.full(dof, 0.3)])[None]
+    (solved,), _, after = InC(scene, dof, tmp_path)("s", 0.0, 1e-3, start, steps=10_000)
+    assert solved
+    assert np.all(np.abs(after[0, dof:]) < 1e-300)
+
+
+@needs_compiler
 def test_a_scene_of_float32_is_written_in_float(tmp_path: Path) -> None:
     scene, dof = scene_of("lugre box")
     scene = jtu.tree_map(lambda x: jnp.asarray(x, jnp.float32), scene)
