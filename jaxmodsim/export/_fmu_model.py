@@ -221,9 +221,14 @@ def _size(tree: PyTree) -> int:
 
 
 def header(
-    model: Model, numbers: Sequence[float], states: Sequence[float], kinds: Sequence[int], **defined: Any
+    model: Model,
+    numbers: Sequence[float],
+    states: Sequence[float],
+    kinds: Sequence[int],
+    least: Sequence[float | None],
+    **defined: Any,
 ) -> str:
-    """Declarations of model.h up to the prototypes: sizes, start values, and coefficients of Rodas5P."""
+    """Declarations of model.h up to the prototypes: sizes, start values, limits, and coefficients of Rodas5P."""
     widths = model.scene.mode_widths(model.y.q.shape[0])
     stops = np.concatenate([[0], np.cumsum(widths)]).astype(int)
     outputs = sum(int(np.prod(shape)) for shape in series_of(model).values())
@@ -236,6 +241,7 @@ def header(
         _array("static const double model_numbers", numbers),
         _array("static const double model_states", states),
         _array("static const int model_kinds", kinds),
+        _array("static const double model_least", [-np.finfo(float).max if x is None else x for x in least]),
         _array("static const int model_modes", stops),
         _array("static const double NODE", RODAS5P.nodes),
         _array("static const double TIME", RODAS5P.time),

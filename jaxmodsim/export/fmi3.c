@@ -212,6 +212,7 @@ fmi3Status fmi3SetFloat64(fmi3Instance instance, REFERENCES, const fmi3Float64 v
     if (*at == values[i]) continue; /* importers repeat values outside of events */
     if (!settable(c, r)) return no_variable(c, "set at this time", r);
     if (!isfinite(values[i])) return fail(c, "set: the value is not finite");
+    if (r < FIRST_STATE && values[i] < model_least[r - FIRST_NUMBER]) return fail(c, "set: the value is below its minimum");
     if (r < FIRST_STATE && model_kinds[r - FIRST_NUMBER] != CONTINUOUS_INPUT) {
       s->changed = s->phase > INITIALIZATION;
     }

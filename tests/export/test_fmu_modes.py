@@ -46,6 +46,8 @@ def test_modes_are_decided_before_the_first_step_and_after_a_jump_of_a_load(tmp_
         assert one.getDirectionalDerivative(*by, [1.0]) == one.getAdjointDerivative(*by, [1.0]) == [-np.sign(force)]
 
     one.instantiate()
+    with pytest.raises(Exception, match="fmi3SetFloat64 failed"):
+        one.setFloat64([place["friction.Fc"]], [-1.0])
     one.enterInitializationMode(tolerance=1e-6, startTime=0.0)
     check(1.0, -1.0)
     one.exitInitializationMode()
