@@ -216,12 +216,11 @@ def parameter(
 
 def parameter_or(name: str, unit: str, instead: tuple[type, ...], *, lower: float, upper: float, default: float) -> Any:
     """A `parameter` that may also be an object of the types `instead`, with its own parameters."""
-    convert = partial(_unless_instance, instead=instead, name=name)
+
+    def convert(value: object) -> object:
+        return value if isinstance(value, instead) else as_number(value, name=name)
+
     return eqx.field(converter=convert, metadata={"range": Range(unit, lower, upper=upper)}, default=Default(default))
-
-
-def _unless_instance(value: object, *, instead: tuple[type, ...], name: str) -> object:
-    return value if isinstance(value, instead) else as_number(value, name=name)
 
 
 def optional_parameter(

@@ -75,7 +75,7 @@ def in_scalars(fn: Callable[..., PyTree], *args: PyTree, seed: Float[Array, "...
         return fn(*args)
     closed, shapes = trace_in_arrays(fn, *args)
     leaves = [x if hasattr(x, "shape") else jnp.asarray(x) for x in jtu.tree_leaves(args)]
-    sizes = [size for size in _sizes(closed.jaxpr) if size <= MAX_ENTRIES]
+    sizes = [size for size in sizes_of(closed.jaxpr) if size <= MAX_ENTRIES]
     if is_known(*leaves) or sum(sizes) > MAX_SCALARS:
         return fn(*args)
     if max(sizes, default=0) > 1:
@@ -131,11 +131,11 @@ def _needed(jaxpr: Jaxpr) -> list[JaxprEqn]:
     return needed[::-1]
 
 
-def _sizes(jaxpr: Any) -> list[int]:
+def sizes_of(jaxpr: Any) -> list[int]:
     """Number of entries of each value of a traced function."""
     inner = [eqn.params["jaxpr"].jaxpr for eqn in jaxpr.eqns if eqn.primitive.name in _CALLS]
     own = [var.aval.size for eqn in jaxpr.eqns for var in eqn.outvars]
-    return own + [size for each in inner for size in _sizes(each)]
+    return own + [size for each in inner for size in sizes_of(each)]
 
 
 def _entries(shape: tuple[int, ...]) -> Iterator[tuple[int, ...]]:

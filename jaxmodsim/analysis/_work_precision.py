@@ -461,7 +461,8 @@ def _row(
     gradient = None
     if derivatives and target.gradient is not None:
         gradient = max(gradient_error({n: float(x) for n, x in each.items()}, target.gradient) for each in derivatives)
-    steps, each = int(run.stats["num_steps"]), evaluations_per_step(prepared.solver, run)
+    steps = int(run.stats["num_steps"])
+    each = evaluations_per_step(prepared.solver, run.request.initial_state)
     return replace(
         row,
         error=error,

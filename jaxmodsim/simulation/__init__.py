@@ -1,6 +1,6 @@
 """Runs of scenes."""
 
-from ._evaluations import evaluations_per_step as evaluations_per_step
+from ._accuracy import evaluations_per_step as evaluations_per_step
 from ._initial_state import project_initial_state as project_initial_state
 from ._observe import named_series as named_series
 from ._observe import named_unit as named_unit

@@ -1,9 +1,14 @@
-"""Report of `simulate_to_accuracy`: the chosen run, and all runs of the search."""
+"""Report of `simulate_to_accuracy`: the chosen run, all runs of the search, and their measure of work."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import diffrax as dfx
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import PyTree
+
+from ..solvers import RODAS5P, Rodas5P
 
 
 class CostScaling(NamedTuple):
@@ -88,3 +93,22 @@ class Accuracy:
             work = "" if run.evaluations is None else str(run.num_steps * run.evaluations)
             lines.append(f"{run.solver:15}  {run.rtol:8.1e}  {run.num_steps:8}  {work:>12}  {run.estimate:8.1e}")
         return "\n".join([*lines, *([self.remark] if self.remark else [])])
+
+
+def evaluations_per_step(solver: dfx.AbstractSolver, y: PyTree) -> int | None:
+    """Evaluations of the vector field in one step from a state `y`, rejected or not; None for methods that iterate.
+
+    One for each stage; a stage that is equal to the last one of the step before counts once (`diffrax.Tsit5`). The
+    Jacobian of `Rodas5P` counts as one for each entry of the state, its time derivative as one.
+
+    **Returns:**
+
+    The number, or None.
+    """
+    if isinstance(solver, Rodas5P):
+        return len(RODAS5P.nodes) + 1 + sum(np.size(x) for x in jtu.tree_leaves(y))
+    if isinstance(solver, dfx.Euler):
+        return 1
+    if isinstance(solver, dfx.AbstractERK) and isinstance(solver.tableau, dfx.ButcherTableau):
+        return solver.tableau.num_stages - bool(solver.tableau.fsal)
+    return None

@@ -98,15 +98,18 @@ class IntegratedSystem(NamedTuple):
         state = self.state(t, y, scene)
         return (state, y.work) if self.audited else state
 
-    def derivative(self, t: Array, y: PyTree, scene: Scene, mode: Array | None = None) -> PyTree:
-        """Right-hand side."""
-        state = self.state(t, y, scene)
+    def derivative(self, t: Array, y: PyTree, scene: Scene, mode: Array | None, *limits: PyTree) -> tuple[PyTree, Any]:
+        """Right-hand side, and from the same forces the guards, if there are limits for them."""
         audited = isinstance(y, AugmentedState)
-        rate, power = from_dynamics(
-            lambda d: (d.canonical_rate if self.canonical else d.rate, d.power if audited else {}),
-            *(t, state, scene, mode),
+        rate, power, guards = from_dynamics(
+            lambda d: (
+                d.canonical_rate if self.canonical else d.rate,
+                d.power if audited else {},
+                d.guards(*limits)[0] if limits else None,
+            ),
+            *(t, self.state(t, y, scene), scene, mode),
         )
-        return AugmentedState(rate, power) if audited else rate
+        return AugmentedState(rate, power) if audited else rate, guards
 
     def advance(self, t0: Array, t1: Array, y: PyTree, scene: Scene) -> tuple[PyTree, Array]:
         """One step of `ImplicitFriction`, and whether it was solved; work uses the powers at its end."""
@@ -170,11 +173,15 @@ class RunFunctions(eqx.Module):
 
     def plain_derivative(self, t: Any, y: PyTree, scene: Scene, mode: Array | None = None) -> PyTree:
         """Right-hand side for these modes; None in a run without modes."""
-        return _derivative(self.system, t, y, scene, mode)
+        return _derivative(self.system, t, y, scene, mode)[0]
 
     def derivative(self, t: Any, s: EventState, scene: Scene) -> EventState:
         """Right-hand side."""
-        return s.rate(_derivative(self.system, t, s.y, scene, s.mode))
+        return s.rate(_derivative(self.system, t, s.y, scene, s.mode)[0])
+
+    def derivative_and_guards(self, t: Any, s: EventState, scene: Scene) -> tuple[PyTree, Array]:
+        """Right-hand side and guards."""
+        return _derivative(self.system, t, s.y, scene, s.mode, self.rest, self.tolerances)
 
     @at_time
     def guards(self, t: Array, s: EventState, scene: Scene) -> tuple[Array, ...]:

@@ -122,14 +122,6 @@ def _tolerances(request: RunRequest) -> tuple[Array, Array]:
     return request.rtol, jnp.maximum(request.atol, float(jnp.finfo(request.atol.dtype).tiny))
 
 
-def _error_control(request: RunRequest, solver: dfx.AbstractSolver) -> dfx.AbstractStepSizeController:
-    if request.dt is not None:
-        return FiniteSteps()
-    (rtol, atol), dtmin = _tolerances(request), _shortest(request)
-    p, i = _ROSENBROCK_GAINS if isinstance(solver, Rodas5P) and not request.scene.mode_names else _GAINS
-    return dfx.PIDController(rtol, atol, pcoeff=p, icoeff=i, dtmin=dtmin, dtmax=request.dtmax, force_dtmin=False)
-
-
 def _solver(
     solver: dfx.AbstractSolver, functions: RunFunctions, scene: Scene, request: RunRequest
 ) -> dfx.AbstractSolver:
@@ -151,6 +143,7 @@ def _solver(
             rtol=functions.tolerances[0],
             dtmin=_shortest(request),
             enforce=True,
+            at_event=functions.derivative_and_guards,
             event_mode=functions.event_mode if sum(functions.widths) > len(functions.widths) else None,
             max_events=request.choices.max_events,
             log=request.choices.log,
@@ -165,7 +158,10 @@ def _step_from(t: Array, scene: Scene) -> Scene:
 
 
 def _controller(request: RunRequest, solver: dfx.AbstractSolver) -> dfx.AbstractStepSizeController:
-    controller = _error_control(request, solver)
+    p, i = _ROSENBROCK_GAINS if isinstance(solver, Rodas5P) and not request.scene.mode_names else _GAINS
+    steps = {"dtmin": _shortest(request), "dtmax": request.dtmax, "force_dtmin": False}
+    adaptive = dfx.PIDController(*_tolerances(request), pcoeff=p, icoeff=i, **steps)
+    controller = adaptive if request.dt is None else FiniteSteps()
     times = sample_times(request.scene.params, linear=True)
     if request.scene.mode_names:
         return EventController(controller, times, direction=1)

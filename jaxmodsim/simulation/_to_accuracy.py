@@ -18,8 +18,7 @@ from .._core.arguments import as_flag
 from .._core.arrays import is_known
 from .._core.trace_checks import check_indices
 from ..scene import Scene
-from ._accuracy import Accuracy, Attempt, CostScaling
-from ._evaluations import evaluations_per_step
+from ._accuracy import Accuracy, Attempt, CostScaling, evaluations_per_step
 from ._observe import named_series
 from ._outcome import SUCCESS, SimulationError, describe_failure
 from ._run_request import MOST_EVENTS, MOST_STEPS, Plugin, RunRequest, run_request
@@ -85,7 +84,7 @@ class _TrialRun:
     @property
     def evaluations(self) -> int | None:
         """Evaluations of the vector field in one step."""
-        return evaluations_per_step(self.solver, self.run)
+        return evaluations_per_step(self.solver, self.run.request.initial_state)
 
 
 @dataclass(frozen=True)

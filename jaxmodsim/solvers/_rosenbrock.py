@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -11,14 +12,15 @@ from jaxtyping import Array, ArrayLike
 
 from .._core.arrays import fusion_barrier, opaque_one
 from .._core.lu import LinearSolver, factor_lu, invert, is_zero
-from .._core.scalarise import columns_of
+from .._core.scalarise import columns_of, sizes_of
 from ._state_layout import Layout, Parts, State
 
-# Up to this many state entries the stages are unrolled; above they are one loop, which halves the program. On two
-# shared cores in float64, a box with one LuGre bristle (3 entries) takes 43 us a run unrolled and 73 us in a loop under
-# vmap over 256 runs, 132 and 142 us alone. A double pendulum with two bristles (6 entries) takes 933 and 733 us, 920
-# and 1 040 us alone, and its reverse gradient compiles in 21 and 12 s.
-_MAX_WRITTEN_OUT = 4
+# Up to this many state entries, and values in the field, the stages are unrolled; above they are one loop. On two
+# shared cores in float64, a box with one LuGre bristle (3 entries, 69 values) takes 43 us a run unrolled and 73 us in a
+# loop under vmap over 256 runs, 132 and 142 us alone. A belt with a Stribeck curve (2 entries, 182 values) takes 1.04
+# and 1.13 ms, 0.79 and 0.97 ms alone, and its reverse gradient compiles in 28 and 18 s of processor time; a puck on a
+# turntable (4 entries, 219 values) takes 309 and 306 us, 343 and 347 us alone, and its gradient 52 and 34 s.
+_MAX_WRITTEN_OUT, _MAX_VALUES = 4, 100
 
 # Maps time, state, field there and a shift to the solver of `(shift I - J) x = rhs`, J the Jacobian of the field.
 ShiftedSolver: TypeAlias = Callable[[Array, State, State, Array], Callable[[State], State]]
@@ -120,7 +122,9 @@ def _looped(tableau: RosenbrockTableau, f0: Parts, slope_at: _Slope, increment: 
     """The increments of all stages in a loop; increments of later stages count as zero."""
     n = len(tableau.nodes)
 
-    # One array over the stages for each part: with one matrix a batch of 256 boxes takes eight times as long.
+    # One array over the stages for each part: with one matrix a batch of 256 boxes takes eight times as long. Reverse
+    # mode evaluates stages again: arrays of their intermediate numbers take a fifth of the time to compile.
+    @partial(jax.checkpoint, prevent_cse=False)
     def stage(stages: Parts, row: tuple[Array, ...]) -> tuple[Parts, None]:
         i, a, c, node, time = row
 
@@ -197,7 +201,8 @@ def rosenbrock_step(
             point = fusion_barrier(point, opaque_one(t0))
         return flow(t0 + jnp.asarray(node, dt.dtype) * dt, point)
 
-    stages = (_written_out if layout.n <= _MAX_WRITTEN_OUT else _looped)(tableau, f0, slope_at, increment)
+    small = layout.n <= _MAX_WRITTEN_OUT and len(sizes_of(jax.make_jaxpr(field)(t0, y0).jaxpr)) <= _MAX_VALUES
+    stages = (_written_out if small else _looped)(tableau, f0, slope_at, increment)
     y1 = layout.join(_add(parts, _combine(tableau.solution, stages)))
     error = layout.join(_combine(tableau.error, stages))
     dense = () if tableau.dense is None else tuple(layout.join(_combine(row, stages)) for row in tableau.dense)

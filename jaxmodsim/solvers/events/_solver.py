@@ -135,6 +135,8 @@ class EventSolver(AbstractSolverWrapper):
       rounding units of time.
     - `event_mode`: `event_mode(mode)` -> the part of the mode that an event changes. A reset that changes only other
       parts, such as the choice of coordinates, is no event. By default all of it.
+    - `at_event`: `at_event(t, s, args)` -> the rate of `s.y` and the guards, where one evaluation gives both. By
+      default they come from the term and from `guards`.
     - `max_events`: limit of the number of events, > 0.
     - `log`: number of entries of the `EventLog` in the state; later events are counted, not logged. By default
       `max_events`; 0 for no log.
@@ -184,6 +186,7 @@ class EventSolver(AbstractSolverWrapper):
     rtol: Real = 1e-6
     dtmin: Real = 0.0
     event_mode: Callable[[PyTree], PyTree] | None = None
+    at_event: Callable[..., tuple[PyTree, Array]] | None = None
     carries_on: bool = eqx.field(default=False, static=True)
     enforce: bool = eqx.field(default=False, static=True)
     max_events: int = eqx.field(default=128, static=True)
@@ -398,10 +401,10 @@ class EventSolver(AbstractSolverWrapper):
         new_args = whole if self.samples is None else self.samples.freeze_args(t, whole)
         # An event within no distance is at a jump of the samples: the way back from it is before the jump.
         back = choose(near == 0, args, new_args)
+        both = self.at_event or (lambda *at: (terms.vf(*at).y, self._guards(*at)))
 
         def evaluate(t: Array, y: PyTree, mode: PyTree, args: PyTree) -> tuple[PyTree, Array]:
-            here = state._replace(y=y, mode=mode)
-            return terms.vf(t, here, args).y, self._guards(t, here, args)
+            return both(t, state._replace(y=y, mode=mode), args)
 
         def way(y: PyTree, mode: PyTree, first: Array, fires: Array) -> tuple[Passage, PyTree, tuple[Array, Array]]:
             """Through the event of the guards `fires`; with the rates of y and of the first guard, and `early`."""
