@@ -462,7 +462,7 @@ def _row(
     if derivatives and target.gradient is not None:
         gradient = max(gradient_error({n: float(x) for n, x in each.items()}, target.gradient) for each in derivatives)
     steps = int(run.stats["num_steps"])
-    each = evaluations_per_step(prepared.solver, run.request.initial_state)
+    each = evaluations_per_step(prepared.solver, (run.q, run.qd, run.z))
     return replace(
         row,
         error=error,

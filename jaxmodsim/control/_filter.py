@@ -275,7 +275,7 @@ class FrictionFilter(eqx.Module):
 
         **Raises:**
 
-        - `ValueError` for arrays that do not match, times that do not increase, and unknown or estimated inputs.
+        - `ValueError` for arrays that do not match, times that decrease, and unknown or estimated inputs.
         """
         kind = self._zero.q.dtype
         t, measured = jnp.asarray(t, kind), jnp.asarray(measured, kind)
@@ -299,7 +299,8 @@ class FrictionFilter(eqx.Module):
         `void NAME(h, u, y, x, s, x_after, s_after, innovation)` has the inputs during the time h in `u` (without
         inputs it is left out), the measurement in `y` (NaN for an absent channel), and the state as mean `x[n]` and
         factor `s[n * n]`. `x_after` and `s_after` may be the same arrays. The numbers of the scene are constants of the
-        code; nothing may depend on time explicitly.
+        code; nothing may depend on time explicitly. The correction has the inputs `u`, too; `run` has those of the
+        measurement, which differ where `measure` or a slip velocity depends on an input.
 
         **Arguments:**
 

@@ -95,18 +95,19 @@ class Accuracy:
         return "\n".join([*lines, *([self.remark] if self.remark else [])])
 
 
-def evaluations_per_step(solver: dfx.AbstractSolver, y: PyTree) -> int | None:
-    """Evaluations of the vector field in one step from a state `y`, rejected or not; None for methods that iterate.
+def evaluations_per_step(solver: dfx.AbstractSolver, ys: PyTree) -> int | None:
+    """Evaluations of the vector field in one step, rejected or not; None for methods that iterate.
 
     One for each stage; a stage that is equal to the last one of the step before counts once (`diffrax.Tsit5`). The
-    Jacobian of `Rodas5P` counts as one for each entry of the state, its time derivative as one.
+    Jacobian of `Rodas5P` counts as one for each entry of the state, its time derivative as one. `ys` are the states of
+    a run, with a leading axis of time.
 
     **Returns:**
 
     The number, or None.
     """
     if isinstance(solver, Rodas5P):
-        return len(RODAS5P.nodes) + 1 + sum(np.size(x) for x in jtu.tree_leaves(y))
+        return len(RODAS5P.nodes) + 1 + sum(np.size(x[0]) for x in jtu.tree_leaves(ys))
     if isinstance(solver, dfx.Euler):
         return 1
     if isinstance(solver, dfx.AbstractERK) and isinstance(solver.tableau, dfx.ButcherTableau):

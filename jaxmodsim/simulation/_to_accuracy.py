@@ -84,7 +84,7 @@ class _TrialRun:
     @property
     def evaluations(self) -> int | None:
         """Evaluations of the vector field in one step."""
-        return evaluations_per_step(self.solver, self.run.request.initial_state)
+        return evaluations_per_step(self.solver, (self.run.q, self.run.qd, self.run.z))
 
 
 @dataclass(frozen=True)
