@@ -20,7 +20,7 @@ from ._state_layout import Layout, Parts, State
 # loop under vmap over 256 runs, 132 and 142 us alone. A belt with a Stribeck curve (2 entries, 182 values) takes 1.04
 # and 1.13 ms, 0.79 and 0.97 ms alone, and its reverse gradient compiles in 28 and 18 s of processor time; a puck on a
 # turntable (4 entries, 219 values) takes 309 and 306 us, 343 and 347 us alone, and its gradient 52 and 34 s.
-_MAX_WRITTEN_OUT, _MAX_VALUES = 4, 100
+_MAX_WRITTEN_OUT, _MAX_VALUES = 4, 150
 
 # Maps time, state, field there and a shift to the solver of `(shift I - J) x = rhs`, J the Jacobian of the field.
 ShiftedSolver: TypeAlias = Callable[[Array, State, State, Array], Callable[[State], State]]
