@@ -216,15 +216,16 @@ class FrictionFilter(eqx.Module):
         """
         kind = self._zero.q.dtype
         y = State(jnp.asarray(q, kind), jnp.asarray(qd, kind), self._zero.z)
-        values = [jnp.asarray(read_element(self.scene, name), kind) for name in self.numbers]
-        for name, x in zip(self.numbers, values, strict=True):
-            if _is_positive(self.scene, name) and is_known(x) and not x > 0:
-                raise ValueError(
-                    f"FrictionFilter estimates the logarithm of {name}, which starts at {x}: start above 0."
-                )
-        values = [
-            jnp.log(x) if _is_positive(self.scene, name) else x for name, x in zip(self.numbers, values, strict=True)
-        ]
+        values = []
+        for name in self.numbers:
+            x = jnp.asarray(read_element(self.scene, name), kind)
+            if _is_positive(self.scene, name):
+                if is_known(x) and not x > 0:
+                    raise ValueError(
+                        f"FrictionFilter estimates the logarithm of {name}, which starts at {x}: start above 0."
+                    )
+                x = jnp.log(x)
+            values.append(x)
         mean = jnp.concatenate([ravel_pytree(y)[0], *[x[None] for x in values]])
         return Gaussian(mean, jnp.diag(self._vector(std, "std")))
 

@@ -1,7 +1,6 @@
 """Filters of scenes with friction: consistency through stick and slip, derivatives, stick, single precision, and C."""
 
 import ctypes
-import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -18,13 +17,13 @@ from jaxmodsim._core.compat import AVAILABLE
 from jaxmodsim.control import FrictionFilter, linearized, unscented
 from jaxmodsim.control._square_root import normalized_square
 
+from ..helpers.compilers import COMPILER
 from ..helpers.differences import central_difference
 
 LEVEL = "friction.normal_force"
 LAW = jms.LuGre(sigma0=1e4, sigma1=100.0, sigma2=1.0, Fc=2.0, Fs=3.0, vs=0.02)
 DRIFT = {"qd[0]": 0.02, "friction.z": 1e-4, LEVEL: 0.05}
 STD = {"q[0]": 1e-4, "qd[0]": 1e-2, "friction.z": 2e-5, LEVEL: 0.2}
-COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 
 
 def energy(t: Any, q: Any, qd: Any, p: Any) -> Any:

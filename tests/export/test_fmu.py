@@ -19,17 +19,13 @@ import numpy as np
 import pytest
 
 import jaxmodsim as jms
-from jaxmodsim._core.compat import AVAILABLE
 from jaxmodsim.export import _compile
 from jaxmodsim.export._fmu_description import base_unit
 from jaxmodsim.problems import belt_oscillator, bouncing_ball, n_link_pendulum, ramped_box, slider_crank
 from jaxmodsim.scene import State, elements, forward_dynamics
 
-OWN = _compile.own_platform()
-needs_fmpy = pytest.mark.skipif(
-    "jaxprs" not in AVAILABLE or _compile.compiler_of(OWN) is None,
-    reason="needs the programs that JAX traces, and a C compiler: ziglang, cc, gcc or clang",
-)
+from ..helpers.compilers import OWN, needs_fmpy
+
 # The wheel of Ecos leaves its library for threads to another wheel, which puts it here.
 THREADS = Path(sys.prefix) / "lib" / "libtbb.so.12"
 needs_ecos = pytest.mark.skipif(

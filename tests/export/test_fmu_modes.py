@@ -6,14 +6,9 @@ import numpy as np
 import pytest
 
 import jaxmodsim as jms
-from jaxmodsim._core.compat import AVAILABLE
-from jaxmodsim.export import _compile
 
-OWN = _compile.own_platform()
-needs_fmpy = pytest.mark.skipif(
-    "jaxprs" not in AVAILABLE or _compile.compiler_of(OWN) is None,
-    reason="needs the programs that JAX traces, and a C compiler: ziglang, cc, gcc or clang",
-)
+from ..helpers.compilers import OWN, needs_fmpy
+
 fmpy = pytest.importorskip("fmpy", reason="needs FMPy, which runs FMUs")
 
 

@@ -2,7 +2,6 @@
 
 import ctypes
 import functools
-import shutil
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -20,8 +19,9 @@ from jaxmodsim._core.compat import AVAILABLE
 from jaxmodsim.problems import belt_oscillator, ramped_box
 from jaxmodsim.scene import State, vector_field
 
+from ..helpers.compilers import COMPILER
+
 pytestmark = pytest.mark.skipif("jaxprs" not in AVAILABLE, reason="needs the programs that JAX traces")
-COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 needs_compiler = pytest.mark.skipif(COMPILER is None, reason="needs a C compiler: cc, gcc or clang")
 FLAGS = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-Wmissing-prototypes", "-O1"]
 CHECKED = ["-fsanitize=undefined,address", "-fno-sanitize-recover=all"]
