@@ -223,31 +223,26 @@ fmi3Status fmi3SetFloat64(fmi3Instance instance, REFERENCES, const fmi3Float64 v
 
 /* The state with which the motion goes on: modes are decided when the initialization or a change between steps ends. */
 static State present(const Instance *c) {
-  State s = c->motion.s;
-  if (s.phase == INITIALIZATION || (s.phase == STEP_MODE && s.changed)) {
-    model_start(s.t, s.numbers, c->motion.tolerances, s.y, s.mode);
-  }
-  return s;
-}
-
-/* Rates, guards and outputs there. */
-static void evaluate(Instance *c) {
-  const State s = present(c);
-  model_evaluate(s.t, s.numbers, s.y, s.mode, c->motion.tolerances, c->evaluated);
+  Motion m = c->motion;
+  if (m.s.phase == INITIALIZATION || (m.s.phase == STEP_MODE && m.s.changed)) motion_start(&m);
+  else if (m.s.phase == STEP_MODE && !m.s.pending && motion_due(&m, 0.0) && !motion_fire(&m)) return c->motion.s;
+  return m.s;
 }
 
 fmi3Status fmi3GetFloat64(fmi3Instance instance, REFERENCES, fmi3Float64 values[], size_t nValues) {
   SELF;
-  STATE;
+  const State s = present(c);
   bool known = false;
   if (nValues != nReferences) return fail(c, "get: one value for each variable is needed");
   for (size_t i = 0; i < nValues; ++i) {
     const fmi3ValueReference r = references[i];
     if (r >= FIRST_MODE) return no_variable(c, "get Float64", r);
-    if (r >= FIRST_EVALUATED && !known) evaluate(c), known = true;
-    values[i] = r == 0             ? s->t
-                : r < FIRST_STATE  ? s->numbers[r - FIRST_NUMBER]
-                : r < FIRST_EVALUATED ? s->y[r - FIRST_STATE]
+    if (r >= FIRST_EVALUATED && !known) {
+      model_evaluate(s.t, s.numbers, s.y, s.mode, c->motion.tolerances, c->evaluated), known = true;
+    }
+    values[i] = r == 0             ? s.t
+                : r < FIRST_STATE  ? s.numbers[r - FIRST_NUMBER]
+                : r < FIRST_EVALUATED ? s.y[r - FIRST_STATE]
                                       : c->evaluated[r - FIRST_EVALUATED];
   }
   return fmi3OK;
