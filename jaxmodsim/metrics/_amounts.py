@@ -16,8 +16,8 @@ def peak(of: str) -> Metric:
 
     The error is that of the dense output, plus up to 1e-6 of the peak if a step is a radian of the fastest motion. If
     more than eight peaks differ by less than about 1e-3 of the amplitude, the result may be any of them. Derivatives
-    are taken at the fixed time of a smooth peak, where the series is stationary, or along the event of a corner. They
-    do not include the dependence on t0 and t1.
+    are taken at the fixed time of a smooth peak, where the series is stationary, along the event of a corner, or at
+    the end of the run if the peak is there and the end is a saved time.
 
     **Arguments:**
 

@@ -11,7 +11,7 @@ from ._trajectory import Trajectory, trajectory
 
 # Number of steps with the largest estimates that are searched for the peak, and of samples in each of them.
 _INTERVALS, _SAMPLES = 8, 16
-# Relative difference up to which a peak counts as that of an event, whose time has a derivative.
+# Relative difference up to which a peak counts as that of an event or of a saved time, which have derivatives.
 _CORNER = 1e-6
 
 
@@ -32,7 +32,7 @@ def peak_of(run: Trajectory, name: str) -> Float[Array, ""]:
     saved = jax.lax.top_k(jnp.where(jnp.isfinite(run.t), jnp.abs(x), 0.0), 1)[0][0]
     between = _between(run, name)
     corner = jax.lax.top_k(jnp.append(jnp.abs(run.event_sides(series)), 0.0), 1)[0][0]
-    smooth = jnp.where(saved > between, saved, between)
+    smooth = jnp.where(saved >= (1.0 - _CORNER) * between, saved, between)
     return jnp.where(corner >= (1.0 - _CORNER) * smooth, corner, smooth)
 
 

@@ -237,9 +237,8 @@ def test_peaks_between_saved_times() -> None:
         del t
         return 0.5 * qd[0] ** 2 - 0.5 * (p["w"] * q[0]) ** 2
 
-    def peak(of: str, w: Any, v: Any) -> Any:
-        ts = np.pi / 1.7 * np.arange(5)
-        run = jms.simulate(jms.Scene(lagrangian, params={"w": w}), [0.0], v[None], 8.0, ts=ts, rtol=1e-9, atol=1e-11)
+    def peak(of: str, w: Any, v: Any, t1: Any = 8.0, ts: Any = np.pi / 1.7 * np.arange(5)) -> Any:
+        run = jms.simulate(jms.Scene(lagrangian, params={"w": w}), [0.0], v[None], t1, ts=ts, rtol=1e-9, atol=1e-11)
         return metrics.peak(of)(run)
 
     w, v = jnp.asarray(1.7), jnp.asarray(3.4)
@@ -247,6 +246,9 @@ def test_peaks_between_saved_times() -> None:
     np.testing.assert_allclose(peak("qd[0]", w, v), 3.4, rtol=2e-6)
     slopes = jax.jit(jax.grad(lambda *x: peak("q[0]", *x), argnums=(0, 1)))(w, v)
     np.testing.assert_allclose(slopes, [-2.0 / 1.7, 1.0 / 1.7], rtol=1e-5)
+    # A run that ends before the first peak: the largest value moves with t1.
+    at_end = jax.jit(jax.value_and_grad(lambda t1: peak("q[0]", w, v, t1, jnp.stack([0.0 * t1, t1]))))(0.6)
+    np.testing.assert_allclose(at_end, [2.0 * np.sin(1.02), 3.4 * np.cos(1.02)], rtol=2e-6)
 
 
 def test_of_equal_peaks_one_has_the_derivative():
