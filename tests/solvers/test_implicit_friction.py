@@ -359,6 +359,20 @@ def test_a_step_with_falling_friction_is_solved() -> None:
     np.testing.assert_allclose(x + h * jax.vmap(impulse)(x, z0), free, rtol=0, atol=1e-15)
 
 
+def test_derivatives_of_a_step_in_steady_slip() -> None:
+    """The bristle does not change there, but its rate after a change of it is that of a whole step."""
+    law = jms.LuGre(sigma0=1e4, sigma1=100.0, sigma2=1.0, Fc=2.0, Fs=3.0, vs=0.02)
+    scene = jms.Scene(mass, {"m": 1.0, "force": 3.0}, (jms.AppliedForce(pull, name="pull"), jms.Friction(law)))
+
+    @jax.jit
+    def after(z: Any) -> Any:
+        y = State(jnp.zeros(1), jnp.array([0.27318847]), {"friction": z})
+        return scene_step(scene, jnp.array(0.0), jnp.array(4e-3), y)[0].qd[0]
+
+    slope = central_difference(after, jnp.array(2e-4), 1e-8)
+    np.testing.assert_allclose([jax.jacfwd(after)(2e-4), jax.grad(after)(2e-4)], slope, rtol=1e-6)
+
+
 def test_second_derivatives_of_a_step() -> None:
     """Against differences of first derivatives, in slip, in both modes."""
     scene = ramped_box.scene(ramped_box.lugre(sigma1=20.0))

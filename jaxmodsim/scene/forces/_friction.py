@@ -428,12 +428,14 @@ class Friction(AbstractEffect):
 def _mean_rate(law: AbstractDynamicLaw, v: Float[Array, "..."], z: PyTree, after: PyTree, dt: Array) -> PyTree:
     """Mean rate of a state that changes from `z` to `after` in `dt` [s] at constant slip velocity.
 
-    It lies between the rates at both ends, which are more accurate than the quotient if that is dominated by rounding.
+    It lies between the rates at both ends, which are more accurate than the quotient if that is dominated by rounding,
+    as in steady slip. The derivative is that of the quotient there, too.
     """
 
     def mean(before: Array, after: Array, first: Array, last: Array) -> Array:
-        quotient = (after - before) / jnp.where(dt == 0, 1.0, dt)
-        return jnp.clip(quotient, jnp.minimum(first, last), jnp.maximum(first, last))
+        quotient = jnp.where(dt == 0, first, (after - before) / jnp.where(dt == 0, 1.0, dt))
+        inside = jnp.clip(quotient, jnp.minimum(first, last), jnp.maximum(first, last))
+        return jax.lax.stop_gradient(inside) + (quotient - jax.lax.stop_gradient(quotient))
 
     return jtu.tree_map(mean, z, after, law.zdot(v, z), law.zdot(v, after))
 
