@@ -365,11 +365,22 @@ REPORTS = {
     ),
     "measured_axis": Report(
         "`jaxmodsim fit` on a measured axis.", "measured_record",
-        (Table(
-            "EMPS record, {samples:,} samples, open-loop error of the position over the whole record, and in four parts"
-            " held out one after the other. Target: {goal} mm with at most 8 parameters. One command, {seconds} s.",
-            ("parameters", "RMSE", "RMSE with 5 steps a sample", "held-out error", "standard error", "not determined"),
-        ),),
+        (
+            Table(
+                "EMPS record, {samples:,} samples, open-loop error of the position over the whole record, and in four"
+                " parts held out one after the other. Target: {goal} mm with at most 8 parameters. One command,"
+                " {seconds} s.",
+                (
+                    "parameters", "RMSE", "RMSE with 5 steps a sample", "held-out error", "standard error",
+                    "not determined",
+                ),
+            ),
+            Table(
+                "Thirds of the record, each predicted by a fit to the other two as two records: error, expected error,"
+                " half width of the 90 % band, and share of the samples in it.",
+                ("error", "expected error", "half band", "samples in the band"), ("peer", "at"),
+            ),
+        ),
     ),
     "servo": Report(
         "`jaxmodsim fit --axis servo` on nine measured records of a servo.", "servo",

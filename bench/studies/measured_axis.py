@@ -2,7 +2,7 @@
 
 One command fits all models to the whole record and to three of its four parts in turn, including start-up and
 compilation. Each fitted model is then run with five integration steps per sample, to check that the error does not
-depend on the step.
+depend on the step. Each third of the record is predicted by fits to the other two.
 """
 
 import json
@@ -17,11 +17,21 @@ import numpy as np
 
 import jaxmodsim as jms
 from bench.record import Result, command
-from jaxmodsim.identify import axis_models, axis_scene, estimate_axis, replay
+from jaxmodsim.identify import (
+    agreement,
+    axis_models,
+    axis_scene,
+    estimate_axis,
+    fit,
+    predict,
+    prediction_error,
+    replay,
+)
 
 # Outside the repository: A. Janot, M. Gautier, M. Brunot, "Data set and reference models of EMPS",
 # Workshop on Nonlinear System Identification Benchmarks, 2019.
 EMPS, EMPS_GAIN = Path(__file__).parents[3] / "shared" / "data" / "emps" / "train.csv", 35.15065188248547
+THIRDS = ("first", "middle", "last")
 
 
 def main(smoke: bool, out: Path) -> Result | None:
@@ -44,6 +54,7 @@ def main(smoke: bool, out: Path) -> Result | None:
         report = json.loads((Path(folder) / "fit.json").read_text())
     if smoke:
         result.add("RMSE with 5 steps a sample", _rmse(record, "coulomb", report["parameters"], 2), "m", peer="coulomb")
+        _add_thirds(result, record, ("coulomb",), ("last",))
         return result
     for each in report["comparison"]["models"]:
         name = each["name"]
@@ -53,7 +64,33 @@ def main(smoke: bool, out: Path) -> Result | None:
         fine = _rmse(record, name, report["comparison"]["fits"][name]["parameters"], 5)
         result.add("RMSE with 5 steps a sample", fine, "m", peer=name)
         result.add("not determined", ", ".join(each["undetermined"]) or "-", peer=name)
+    _add_thirds(result, record, tuple(each["name"] for each in report["comparison"]["models"]), THIRDS)
     return result
+
+
+def _add_thirds(result: Result, record: jms.Record, models: tuple[str, ...], held_out: tuple[str, ...]) -> None:
+    """Thirds of the record, each predicted by a fit to the other two as two records."""
+    count = len(record.t) // len(THIRDS)
+    parts = {name: _part(record, slice(i * count, (i + 1) * count), name) for i, name in enumerate(THIRDS)}
+    for name in models:
+        model = axis_models()[name]
+        for held in held_out:
+            fitted = [x for key, x in parts.items() if key != held]
+            scene = axis_scene(model, estimate_axis(fitted[0]))
+            found = fit(scene, fitted, model.free, limits={"m": (0.0, None)})
+            agreed = agreement(found)
+            predicted = predict(found, parts[held], agreement=agreed)
+            half = 0.5 * (predicted.upper["measured"] - predicted.lower["measured"])[predicted.counts]
+            row = {"peer": name, "at": f"{held} third"}
+            result.add("error", predicted.score.rmse["measured"], "m", **row)
+            result.add("expected error", prediction_error(found, agreement=agreed)["measured"].total, "m", **row)
+            result.add("half band", float(np.sqrt(np.mean(half**2))), "m", **row)
+            result.add("samples in the band", 100 * predicted.shares["measured"], "%", **row)
+
+
+def _part(record: jms.Record, samples: slice, name: str) -> jms.Record:
+    """Some samples of a record."""
+    return jms.Record(record.t[samples], record.measured[samples], {"u": record.inputs["u"][samples]}, name)
 
 
 def _rmse(record: jms.Record, model: str, parameters: dict[str, Any], substeps: int) -> float:

@@ -10,7 +10,7 @@ from matplotlib.text import Text
 import jaxmodsim as jms
 from jaxmodsim import plot
 from jaxmodsim.identify import agreement, evaluate_on, law_force, predict, prediction_error, replay
-from jaxmodsim.identify.selection._agreement import _between, _covariance_between
+from jaxmodsim.identify.selection._agreement import _between, _covariance_between, covariances
 from jaxmodsim.problems.braked_spring import driven_spring
 
 T = np.arange(0.0, 4.0, 5e-3)
@@ -138,6 +138,30 @@ def test_a_scene_on_another_day_and_its_figure(axis):
     assert any(f"contains {100 * other.shares['x']:.0f} %" in label for label in labels)
     alone = [text.get_text() for text in plot.score_figure(other.score).axes[0].findobj(Text)]
     assert not any("contains" in label for label in alone)
+
+
+def test_a_record_that_starts_in_motion_is_as_uncertain_as_its_first_samples_and_not_as_the_model():
+    drive = jms.AppliedForce(lambda t, q, qd, p: jnp.reshape(p["u"], (1,)))
+    scene = jms.Scene(lambda t, q, qd, p: 0.5 * p["m"] * qd[0] ** 2, {"m": 1.5, "u": 0.0}, (drive,))
+    t, noise, rate = 5e-3 * np.arange(600), 1e-5, 2 * np.pi * 0.7
+
+    def pulled(seed: int, speed: float) -> jms.Record:
+        """A free mass of 2 kg, pulled by a sine, and moved by millimetres by what the model does not know."""
+        unknown = 5e-3 * (1 - np.cos(t))
+        q = speed * t + 3.0 * (t / rate - np.sin(rate * t) / rate**2) + unknown
+        x = q + noise * np.random.default_rng(seed).standard_normal(t.size)
+        return jms.Record(t, {"x": x}, {"u": 6.0 * np.sin(rate * t)}, f"of {speed} m/s", linear=("u",))
+
+    result = jms.fit(scene, pulled(0, 0.0), ("m",), q0=[0.0], qd0=[0.0], observe={"x": "q[0]"})
+    found = predict(result, pulled(1, 0.3))
+    assert found.model["x"][0] > 50 * noise
+    first = ~found.counts
+    by_m = 3.0 * (t / rate - np.sin(rate * t) / rate**2) / 2.0
+    by_m -= np.polyval(np.polyfit(t[first], by_m[first], 1), t)
+    far = t - np.mean(t[first])
+    start = noise * np.sqrt(1 / np.sum(first) + far**2 / np.sum(far[first] ** 2))
+    by_m *= np.sqrt(covariances(result, 0.0, None)[0][0, 0])
+    assert found.parameters["x"][found.counts] == pytest.approx(np.hypot(start, by_m)[found.counts], rel=0.3)
 
 
 def test_short_records_show_their_start_by_half_of_them(axis):

@@ -1,6 +1,7 @@
 """A prediction band on a new record, and the error to expect there."""
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -11,6 +12,7 @@ from scipy import special  # scipy.stats takes most of a second to import
 
 from ..._core.arguments import as_share
 from ..data._record import Record
+from ..data._signals import sample_noise
 from ..estimate._search import SearchOptions, SearchResult, channels_seen, start_search, step
 from ..model._engines import DELAY, with_values
 from ..uncertainty._result import FitResult
@@ -126,7 +128,7 @@ def predict(
     At each sample the band has the variance `J (V + (1 + 1/n) T) J' + s^2` of normal errors:
 
     - J is the change of the output with the parameters, from runs at sqrt(3) standard deviations on either side, with
-      the start fitted again to the first samples.
+      the start fitted again to the first samples. The noise of these samples adds the error of the start.
     - V is the covariance of the estimate from n records, T that of the parameters between records.
     - s^2 is the mean square of the residual of the fitted records, times one plus the share of the degrees of freedom
       of the fit, with correlation in time (Takeuchi 1976).
@@ -156,7 +158,7 @@ def predict(
     own, between = covariances(result, variation, agreement)
     run = run_on(result, record, q0, qd0)
     score, noise, channels = score_of(run), search.problem.noise, sorted(record.channels)
-    by_start, back = _start(run, np.tile(~run.counts, len(channels)))
+    by_start, back, by_noise = _start(run, score, noise)
 
     def deviations(covariance: np.ndarray, beside: np.ndarray) -> dict[str, np.ndarray]:
         square = beside
@@ -169,7 +171,7 @@ def predict(
     excess = _model_excess(search)
     causes = {
         "model": {name: np.full(len(record.t), float(noise[name]) * excess[name] ** 0.5) for name in channels},
-        "parameters": deviations(own, np.sum((by_start @ (back @ back.T)) * by_start, axis=1)),
+        "parameters": deviations(own, by_noise),
         "between": deviations(between, np.zeros(len(by_start))),
     }
     half = {
@@ -228,15 +230,27 @@ def _model_excess(search: SearchResult) -> dict[str, float]:
 
 
 def _start(
-    run: RecordRun, shown: Bool[np.ndarray, " rows"]
-) -> tuple[Float[np.ndarray, "rows local"], Float[np.ndarray, "local rows"]]:
-    """Derivatives of the output by the start, and of a start that is fitted to the rows `shown`, in noise levels."""
+    run: RecordRun, score: Score, noise: Mapping[str, Array]
+) -> tuple[Float[np.ndarray, "rows local"], Float[np.ndarray, "local rows"], Float[np.ndarray, " rows"]]:
+    """Derivatives of the output by the start, of the start by the first samples, and the variance that it adds.
+
+    All in noise levels of the fit. The start has errors from the noise of the first samples. They are shorter than
+    what the residual of the model takes to grow.
+    """
+    channels, shown = sorted(score.outputs), ~run.counts
+    rows = len(channels) * shown.size
     if not shown.any():
-        return np.zeros((shown.size, 0)), np.zeros((0, shown.size))
+        return np.zeros((rows, 0)), np.zeros((0, rows)), np.zeros(rows)
     # The first step of a search, which a score compiles anyway, only evaluates x.
     state = step(run.problem, start_search(run.x, run.problem.rows), jnp.asarray(SearchOptions().rtol, run.x.dtype))
     jacobian = np.asarray(state.jacobian)[: run.problem.samples]
-    return jacobian, np.linalg.pinv(np.where(shown[:, None], jacobian, 0.0), rcond=1e-10)
+    back = np.linalg.pinv(np.where(np.tile(shown, len(channels))[:, None], jacobian, 0.0), rcond=1e-10)
+    levels = [
+        max(sample_noise(score.record.channels[name]), rms(score.residuals[name][shown])) / float(noise[name])
+        for name in channels
+    ]
+    scatter = back * np.repeat(levels, shown.size)
+    return jacobian, back, np.sum((jacobian @ (scatter @ scatter.T)) * jacobian, axis=1)
 
 
 def _output(run: RecordRun, search: SearchResult, x: Float[Array, " free"]) -> dict[str, Array]:
