@@ -237,7 +237,9 @@ def test_peaks_between_saved_times() -> None:
         del t
         return 0.5 * qd[0] ** 2 - 0.5 * (p["w"] * q[0]) ** 2
 
-    def peak(of: str, w: Any, v: Any, t1: Any = 8.0, ts: Any = np.pi / 1.7 * np.arange(5)) -> Any:
+    zeros = np.pi / 1.7 * np.arange(5)
+
+    def peak(of: str, w: Any, v: Any, t1: Any = 8.0, ts: Any = zeros) -> Any:
         run = jms.simulate(jms.Scene(lagrangian, params={"w": w}), [0.0], v[None], t1, ts=ts, rtol=1e-9, atol=1e-11)
         return metrics.peak(of)(run)
 

@@ -369,7 +369,7 @@ def test_derivatives_of_a_step_in_steady_slip() -> None:
         y = State(jnp.zeros(1), jnp.array([0.27318847]), {"friction": z})
         return scene_step(scene, jnp.array(0.0), jnp.array(4e-3), y)[0].qd[0]
 
-    slope = central_difference(after, jnp.array(2e-4), 1e-8)
+    slope = central_difference(after, 2e-4, 1e-8)
     np.testing.assert_allclose([jax.jacfwd(after)(2e-4), jax.grad(after)(2e-4)], slope, rtol=1e-6)
 
 
