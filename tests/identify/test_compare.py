@@ -166,6 +166,26 @@ def test_laws_are_compared_by_blocks_that_were_held_out():
     assert by_name["LuGre"].undetermined  # its Stribeck effect, of which there is nothing in the record
 
 
+def test_models_with_equal_errors_are_a_tie_and_one_held_out_part_has_no_standard_error():
+    t = np.arange(0.0, 2.0, 2e-2)
+    u = 3.0 * np.sin(4.0 * t)
+    x = np.asarray(replay(scene(jms.Viscous(2.0)), jnp.asarray(t), {"u": jnp.asarray(u)}, jnp.zeros(1), jnp.zeros(1)))
+    x = x + 1e-4 * np.random.default_rng(1).standard_normal(t.size)
+    record, short = jms.Record(t, x, {"u": u}), jms.Record(t[:40], x[:40], {"u": u[:40]}, "short")
+    flat = jms.Regularized(jms.Stribeck(Fc=0.0, Fs=0.0, vs=0.1, Fv=1.0), WIDTH)  # vs has no effect
+    models = {
+        "more": Candidate(scene(flat), ("friction.vs", "friction.Fv")),
+        "less": Candidate(scene(flat), ("friction.Fv",)),
+    }
+    found = compare(models, record, hold_out=record, folds=2)
+    assert all(x.over_the_best <= x.over_the_best_standard_error < 1e-3 * x.expected for x in found.ranked)
+    assert found.simplest == "less"
+    assert "more than one standard error" not in found.conclusion
+    # The first 20 samples of each record show its start, and the others are one half of it.
+    alone = compare(models, record, hold_out=short, folds=2)
+    assert all(np.isinf(x.standard_error) and np.isinf(x.over_the_best_standard_error) for x in alone.ranked)
+
+
 @pytest.mark.parametrize(
     ("models", "options", "text"),
     [

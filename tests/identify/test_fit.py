@@ -396,9 +396,17 @@ def test_wrong_options_are_refused(clean, options, text):
 def test_fit_law_refuses_noise_that_differs_between_records():
     t = np.linspace(0.0, 1.0, 51)
     motion, force = {"x": 1e-3 * np.sin(t)}, np.cos(t)
-    records = [jms.Record(t, force, motion, noise=level) for level in (1e-3, 1e-1)]
+    records = [jms.Record(t, force, motion, str(level), noise=level) for level in (1e-3, 1e-1)]
     with pytest.raises(ValueError, match="noise of 'measured' differs between the records"):
         jms.fit_law(jms.Dahl(sigma0=1e4, Fc=2.0), records)
+
+
+def test_fit_law_refuses_records_with_other_inputs():
+    t = np.linspace(0.0, 1.0, 51)
+    motion, force = {"x": 1e-3 * np.sin(t)}, np.cos(t)
+    loaded = jms.Record(t, force, motion | {"normal": 1.0 + t}, "loaded")
+    with pytest.raises(ValueError, match=r"free has \['x'\], linear \[\], loaded has \['x', 'normal'\]"):
+        jms.fit_law(jms.Dahl(sigma0=1e4, Fc=2.0), [jms.Record(t, force, motion, "free"), loaded])
 
 
 def test_fit_law_leaves_alone_what_starts_on_its_limit_and_how_the_law_is_run():

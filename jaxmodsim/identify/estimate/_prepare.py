@@ -117,7 +117,7 @@ def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str
 
     - `ValueError` as `fit` does.
     """
-    several = _several(records)
+    several = several_records(records)
     _check_inputs(scene, several)
     for _, module in modules_of(scene):
         check_ranges(module)
@@ -163,7 +163,8 @@ def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str
     return Prepared(problem, several, windows, units, known)
 
 
-def _several(records: object) -> tuple[Record, ...]:
+def several_records(records: object) -> tuple[Record, ...]:
+    """One record or several, of different names and the same inputs."""
     several = (records,) if isinstance(records, Record) else records
     if not isinstance(several, tuple | list) or not several or not all(isinstance(x, Record) for x in several):
         raise ValueError(f"records must be a Record or several of them, but {records!r} was given.")
@@ -174,10 +175,8 @@ def _several(records: object) -> tuple[Record, ...]:
     first = several[0]
     for record in several[1:]:
         if set(record.inputs) != set(first.inputs) or record.linear != first.linear:
-            raise ValueError(
-                f"All records need the same inputs: {first.name} has {list(first.inputs)}, {record.name} has"
-                f" {list(record.inputs)}."
-            )
+            has = [f"{each.name} has {list(each.inputs)}, linear {sorted(each.linear)}" for each in (first, record)]
+            raise ValueError(f"All records need the same inputs: {', '.join(has)}.")
     return tuple(several)
 
 

@@ -27,14 +27,12 @@ from ..model._observe import Observable, by_channel, first_coordinate
 from ..model._parameters import split_entries
 from ..uncertainty._fit import fit_law, fit_scene
 from ..uncertainty._result import FitResult
-from ._comparison import Comparison, CrossValidated, Part, comparison_of
+from ._comparison import ENOUGH, Comparison, CrossValidated, Part, comparison_of
 from ._evaluation import after, begin, check_lengths, sample_counts, shown_starts
 
 # Called after each iteration with the name of the model, the number of the held-out fold (None: the fit to everything),
 # the number of the iteration and the root mean square of the residual.
 CompareProgress: TypeAlias = Callable[[str, int | None, int, float], None]
-# Relative tolerance of the fits to all but a fold, which start close to the optimum: three digits of the error.
-_ENOUGH = 1e-4
 
 
 @dataclass(frozen=True)
@@ -266,7 +264,7 @@ def _validate_law(
     problem, held = search.problem, []
     block = _blocks(problem.runs, folds)
     for fold in range(folds):
-        asked = SearchOptions(_ENOUGH, options.max_steps, _progress_of(report, name, fold))
+        asked = SearchOptions(ENOUGH, options.max_steps, _progress_of(report, name, fold))
         held += _held_out(problem, search.state.x, result, block == fold, block, asked)[0]
     return CrossValidated(result, tuple(held), ())
 
@@ -286,7 +284,7 @@ def _validate_scene(
     own = [each for each in options.initializers if not isinstance(each, Continuation) or each.name in numbers]
 
     def search_options(fold: int | None) -> SearchOptions:
-        return SearchOptions(_ENOUGH, options.max_steps, _progress_of(report, name, fold))
+        return SearchOptions(ENOUGH, options.max_steps, _progress_of(report, name, fold))
 
     result = fit_scene(
         scene,

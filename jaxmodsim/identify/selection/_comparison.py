@@ -26,6 +26,8 @@ Part: TypeAlias = dict[str, np.ndarray]
 _SHARE, _FAR = 0.5, 1e6
 # Held-out errors that differ by no more than this factor make no difference in use.
 _AS_GOOD = 1.1
+# Relative tolerance of the fits to all but a part, which start close to the optimum: errors that are closer are equal.
+ENOUGH = 1e-4
 # Undetermined parameters that the conclusion names.
 _MOST_NAMES = 4
 
@@ -83,7 +85,7 @@ class Ranked:
       variances that uncertain parameters add over whole records and that a varying friction level adds. With held-out
       records, which show these, it is `held_out`.
     - `over_the_best`, `over_the_best_standard_error`: `expected` less that of the best model, and the standard error of
-      this difference, from the differences in each part.
+      this difference, from the differences in each part; at least the tolerance of the fits, 1e-4 of `expected`.
     - `fitted`: root mean square error of the fit to everything.
     - `takeuchi`, `bic`: information criteria less the least of all models; see `Comparison`.
     - `penalty`: effective number of parameters, of Takeuchi's criterion.
@@ -320,7 +322,7 @@ def comparison_of(
         held_out, root, least = (float(np.sqrt(x)) for x in (means[name], expected[name], expected[best]))
         error = _standard_error(losses[name], count) / (2 * held_out) if held_out > 0 else 0.0
         difference = _standard_error(losses[name] - losses[best], count)
-        difference = difference / (root + least) if root + least else 0.0
+        difference = max(difference / (root + least) if root + least else 0.0, ENOUGH * root)
         starts = kept[name].start_fitted
         start_fitted = None
         if starts:
@@ -401,7 +403,9 @@ def _root(part: Part, loss: AbstractLoss, levels: Mapping[str, float]) -> float:
 
 
 def _standard_error(values: np.ndarray, count: np.ndarray) -> float:
-    """Of the mean of parts, weighted by their numbers of samples."""
+    """Of the mean of parts, weighted by their numbers of samples; infinite for one part."""
+    if len(values) < 2:
+        return float("inf")
     share = count / np.sum(count)
     around = values - np.sum(share * values)
     return float(np.sqrt(np.sum((share * around) ** 2) * len(values) / (len(values) - 1)))

@@ -19,7 +19,15 @@ from ...scene import Scene, scene_numbers, scene_ranges
 from ..data._record import Record, Windows, cut, runs_of
 from ..data._signals import outliers, sampling_gaps
 from ..estimate._initializers import AbstractInitializer, as_initializers, run_initializers
-from ..estimate._prepare import FitOptions, MultipleShooting, StartState, noise_level, prepare, step_error
+from ..estimate._prepare import (
+    FitOptions,
+    MultipleShooting,
+    StartState,
+    noise_level,
+    prepare,
+    several_records,
+    step_error,
+)
 from ..estimate._problem import AbstractLoss, FitProblem, Prior, SquaredLoss
 from ..estimate._search import (
     Progress,
@@ -210,8 +218,8 @@ def fit_law(
 
     **Raises:**
 
-    - `ValueError` for unknown names or inputs, noise that differs between the records, or a law that cannot run by
-      itself.
+    - `ValueError` for unknown names or inputs, inputs or noise that differ between the records, or a law that cannot
+      run by itself.
 
     **Example:**
 
@@ -228,7 +236,7 @@ def fit_law(
     {'sigma0': '2e+04', 'Fc': '3'}
     ```
     """
-    several = (record,) if isinstance(record, Record) else tuple(record)
+    several = several_records(record)
     for each in several:
         if "x" not in each.inputs or not (is_state_dependent(law) or set(each.inputs) <= {"x", "normal"}):
             raise ValueError(
@@ -247,7 +255,7 @@ def fit_law(
         (),
         None,
         runs_of(several, windows),
-        {name: on_device(noise_level(name, several)) for name in several[0].channels},
+        {name: on_device(noise_level(name, several)) for each in several for name in each.channels},
         SquaredLoss() if loss is None else loss,
         Prior.of({}, parameters.names),
     )
