@@ -16,6 +16,7 @@ from ._options import (
     SweepRequest,
     check_axis,
     check_exists,
+    check_outputs,
     command_of,
 )
 
@@ -92,6 +93,8 @@ def fit(request: FitRequest) -> None:
     Ctrl-C ends the search; its result so far is written, and the exit code is 130.
     """
     check_axis(request)
+    tables = [request.out / name for name in ("fit.csv", "ranking.csv")] + ([request.next] if request.next else [])
+    check_outputs(tables, [*request.records, *request.held_out])
     _start(*request.records, *request.held_out)
     if request.axis == "servo":
         from ._servo import run_servo_fit
@@ -110,6 +113,8 @@ def predict(request: PredictRequest) -> None:
 
     Writes for each RECORD a CSV of t, q, lower and upper, a JSON summary and a figure.
     """
+    names = [f"{path.stem}{ending}" for path in request.records for ending in (".csv", ".json")]
+    check_outputs([request.out / name for name in names], [request.fit, *request.records])
     _start(request.fit, *request.records)
     from ._servo import run_servo_prediction
 

@@ -1,7 +1,7 @@
 """Arguments and options of the commands with their help: imported at once, so nothing heavy in here."""
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -230,6 +230,20 @@ def check_exists(path: Path) -> None:
     """
     if not path.exists():
         raise ValueError(f"There is no file {path}.")
+
+
+def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
+    """Refuse outputs that would replace an input, or one another.
+
+    **Raises:**
+
+    - `ValueError` naming the file.
+    """
+    taken = dict.fromkeys((path.resolve() for path in inputs), "a file that is read")
+    for path in outputs:
+        if other := taken.get(path.resolve()):
+            raise ValueError(f"{path} would replace {other}: rename one of them, or use another folder for --out.")
+        taken[path.resolve()] = "a result of another record"
 
 
 def check_axis(request: FitRequest) -> None:

@@ -274,9 +274,11 @@ def _parts(record: Record) -> tuple[tuple[Record, ...], list[str]]:
     parts = tuple(record.samples(a, b, f"{record.name} part {i + 1}") for i, (a, b) in enumerate(spans))
     where = ", ".join(f"from {record.t[k]:g} to {record.t[k + 1]:g} s" for k in gaps[:_NAMED])
     more = f" and {len(gaps) - _NAMED} more" if len(gaps) > _NAMED else ""
+    left = len(record.t) - sum(len(part.t) for part in parts)
+    short = f" {left} samples in parts of fewer than {_LEAST_PART} are left out." if left else ""
     return parts, [
-        f"samples are missing {where}{more}; the parts are fitted as {len(parts)} records, each with its"
-        " own initial state."
+        f"samples are missing {where}{more}; the parts are fitted as {len(parts)} record{'s' * (len(parts) > 1)}, each"
+        f" with its own initial state.{short}"
     ]
 
 

@@ -20,6 +20,23 @@ def test_help_and_usage_errors(run_command):
     assert run_command("simulate")[0] == 2
 
 
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (("fit", "fit.csv"), "fit.csv would replace a file that is read"),
+        (("fit", "run.csv", "--next", "run.csv"), "run.csv would replace a file that is read"),
+        (("predict", "fit.json", "run.csv"), "run.csv would replace a file that is read"),
+        (("predict", "fit.json", "a/fit.csv"), "fit.json would replace a file that is read"),
+        (("predict", "a/fit.json", "a/run.csv", "b/run.csv"), "run.csv would replace a result of another record"),
+    ],
+)
+def test_no_output_replaces_an_input_or_another_output(run_command, tmp_path, monkeypatch, arguments, text):
+    monkeypatch.chdir(tmp_path)
+    code, _, errors = run_command(*arguments, "--out", ".")
+    assert code == 2
+    assert text in errors
+
+
 def test_an_output_that_fails_leaves_nothing_half_written(tmp_path, monkeypatch):
     def fail(self, *arguments, **options):
         del self, arguments, options

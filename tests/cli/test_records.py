@@ -171,6 +171,10 @@ def test_a_record_is_cut_where_samples_are_missing(tmp_path):
     assert read.parts[1].t[0] > 11.5
     (note,) = read.notes
     assert note.startswith("run: samples are missing from 10.9975 to 11.5025 s; the parts are fitted as 2 records")
+    (note,) = read_record(written(tmp_path, FRAME.loc[(T[10] > T) | (T[10] + 0.5 < T)]), names()).notes
+    assert note.endswith(
+        "fitted as 1 record, each with its own initial state. 10 samples in parts of fewer than 20 are left out."
+    )
     # Times that jitter, or differ throughout, are no gaps.
     for steps in (1.0 + RANDOM.random(99), RANDOM.exponential(size=99)):
         assert not sampling_gaps(Record(np.cumsum(steps), steps, {"u": steps}))
