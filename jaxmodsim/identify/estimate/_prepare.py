@@ -117,7 +117,7 @@ def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str
 
     - `ValueError` as `fit` does.
     """
-    several = several_records(records)
+    several = records_of(records)
     _check_inputs(scene, several)
     for _, module in modules_of(scene):
         check_ranges(module)
@@ -163,7 +163,7 @@ def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str
     return Prepared(problem, several, windows, units, known)
 
 
-def several_records(records: object) -> tuple[Record, ...]:
+def records_of(records: object) -> tuple[Record, ...]:
     """One record or several, of different names and the same inputs."""
     several = (records,) if isinstance(records, Record) else records
     if not isinstance(several, tuple | list) or not several or not all(isinstance(x, Record) for x in several):
@@ -172,11 +172,10 @@ def several_records(records: object) -> tuple[Record, ...]:
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"Two records have the name {name!r}; pass name= to tell them apart.")
-    first = several[0]
-    for record in several[1:]:
-        if set(record.inputs) != set(first.inputs) or record.linear != first.linear:
-            has = [f"{each.name} has {list(each.inputs)}, linear {sorted(each.linear)}" for each in (first, record)]
-            raise ValueError(f"All records need the same inputs: {', '.join(has)}.")
+    kinds = [f"{x.name} has {sorted(x.inputs)}, linear {sorted(x.linear)}" for x in several]
+    for record, kind in zip(several, kinds, strict=True):
+        if kind.removeprefix(record.name) != kinds[0].removeprefix(several[0].name):
+            raise ValueError(f"All records need the same inputs: {kinds[0]}, {kind}.")
     return tuple(several)
 
 

@@ -255,10 +255,9 @@ def _validate_law(
     law, folds = candidate.scene, options.folds
     assert isinstance(law, AbstractLaw)
     initializers = (*options.initializers, *_from_smaller(tuple(ranges_of(law)), judged))
-    told = _progress_of(report, name, None) or False
     result = fit_law(
         law, options.records, candidate.free, loss=options.fit.loss, initializer=initializers,
-        max_steps=options.max_steps, progress=told,
+        max_steps=options.max_steps, progress=_progress_of(report, name, None) or False,
     )  # fmt: skip
     search = _finished(result.search)
     problem, held = search.problem, []
@@ -302,8 +301,7 @@ def _validate_scene(
         return CrossValidated(result, *_evaluated(problem, x, result, block, search_options(0)))
     reached = _reached(search, options.records, folds)
     problem = _with_own_starts(scene, options.windows, reached, search, options)
-    fold = np.arange(problem.count) % folds
-    block = np.broadcast_to(fold[:, None], problem.runs.t.shape)
+    block = np.broadcast_to(np.arange(problem.count)[:, None] % folds, problem.runs.t.shape)
     # Windows start as their first samples show. Free starts would take up errors of the model in the fitted windows,
     # and the parameters would then not fit a window whose start does not.
     x = _with_starts_of(problem, search)

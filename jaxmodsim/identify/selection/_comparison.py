@@ -406,9 +406,8 @@ def _standard_error(values: np.ndarray, count: np.ndarray) -> float:
     """Of the mean of parts, weighted by their numbers of samples; infinite for one part."""
     if len(values) < 2:
         return float("inf")
-    share = count / np.sum(count)
-    around = values - np.sum(share * values)
-    return float(np.sqrt(np.sum((share * around) ** 2) * len(values) / (len(values) - 1)))
+    around = count * (values - np.average(values, weights=count)) / np.sum(count)
+    return float(np.sqrt(np.sum(around**2) * len(values) / (len(values) - 1)))
 
 
 def _undetermined(result: FitResult) -> tuple[str, ...]:

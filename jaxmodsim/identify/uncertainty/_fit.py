@@ -19,15 +19,7 @@ from ...scene import Scene, scene_numbers, scene_ranges
 from ..data._record import Record, Windows, cut, runs_of
 from ..data._signals import outliers, sampling_gaps
 from ..estimate._initializers import AbstractInitializer, as_initializers, run_initializers
-from ..estimate._prepare import (
-    FitOptions,
-    MultipleShooting,
-    StartState,
-    noise_level,
-    prepare,
-    several_records,
-    step_error,
-)
+from ..estimate._prepare import FitOptions, MultipleShooting, StartState, noise_level, prepare, records_of, step_error
 from ..estimate._problem import AbstractLoss, FitProblem, Prior, SquaredLoss
 from ..estimate._search import (
     Progress,
@@ -236,7 +228,7 @@ def fit_law(
     {'sigma0': '2e+04', 'Fc': '3'}
     ```
     """
-    several = several_records(record)
+    several = records_of(record)
     for each in several:
         if "x" not in each.inputs or not (is_state_dependent(law) or set(each.inputs) <= {"x", "normal"}):
             raise ValueError(
