@@ -172,10 +172,10 @@ def records_of(records: object) -> tuple[Record, ...]:
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"Two records have the name {name!r}; pass name= to tell them apart.")
-    kinds = [f"{x.name} has {sorted(x.inputs)}, linear {sorted(x.linear)}" for x in several]
-    for record, kind in zip(several, kinds, strict=True):
-        if kind.removeprefix(record.name) != kinds[0].removeprefix(several[0].name):
-            raise ValueError(f"All records need the same inputs: {kinds[0]}, {kind}.")
+    for record in several[1:]:
+        if set(record.inputs) != set(several[0].inputs) or record.linear != several[0].linear:
+            one, other = (f"{x.name} has {sorted(x.inputs)}, linear {sorted(x.linear)}" for x in (several[0], record))
+            raise ValueError(f"All records need the same inputs: {one}; {other}.")
     return tuple(several)
 
 
