@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from ..mechanics import energies
 from ..scene import Scene, State
 from ..solvers import EventLog
+from ..solvers.events._guard_scan import instant
 from ._integrated_system import Work
 from ._run_request import RunRequest
 
@@ -70,9 +71,8 @@ def event_losses(
     """
     scene = request.scene
     lost = _energy(scene, request.t0, request.initial_state) - _energy(scene, request.t0, start)
-    losses = jnp.broadcast_to(lost, t.shape)
     if log is None:
-        return losses
+        return jnp.broadcast_to(lost, t.shape)
 
     def drop(t: Array, before: State, after: State) -> Array:
         return _energy(scene, t, before) - _energy(scene, t, after)
@@ -80,8 +80,9 @@ def event_losses(
     happened = jnp.isfinite(log.t)
     at = jnp.where(happened, log.t, request.t0)
     drops = jax.vmap(drop)(at, log.before[0], log.after[0])
-    counts = happened[None, :] & (at[None, :] <= t[:, None])
-    return losses + jnp.sum(jnp.where(counts, drops[None, :], 0.0), axis=1)
+    begins = at - instant(4.0 * jnp.finfo(at.dtype).eps * jnp.abs(at))  # states saved from here on are those after it
+    counts = happened[None, :] & (begins[None, :] <= t[:, None])
+    return lost + jnp.sum(jnp.where(counts, drops[None, :], 0.0), axis=1)
 
 
 def _stored(t: Array, y: State, scene: Scene) -> dict[str, Array]:

@@ -122,6 +122,32 @@ def test_a_contact_opens_where_its_reaction_falls_to_zero():
     np.testing.assert_allclose(run.q[-1, 0], A * np.sin(omega * 0.3), rtol=1e-14)
 
 
+def test_a_block_leaves_what_it_has_struck_at_once():
+    """A braked block strikes a free one without restitution: it goes on slower, and the contact opens at the impact."""
+
+    def blocks(t, q, qd, p):
+        return 0.5 * p["m"] * qd[0] ** 2 + 0.5 * qd[1] ** 2
+
+    brake = jms.AppliedForce(lambda t, q, qd, p: jnp.stack([-p["F"], 0.0 * t]))
+    gap = jms.Contact(lambda t, q, p: q[1] - q[0], restitution=0.0)
+
+    def run(x):
+        scene = jms.Scene(blocks, {"F": x[2], "m": x[3]}, (brake,), constraints=(gap,))
+        end = jms.simulate(scene, jnp.stack([-x[0], 0.0 * x[0]]), jnp.stack([x[1], 0.0 * x[0]]), 1.0, **TIGHT)
+        return jnp.concatenate([end.q[-1], end.qd[-1]])
+
+    def exact(x):
+        distance, speed, force, m = x
+        a = force / m
+        t = (speed - jnp.sqrt(speed**2 - 2 * a * distance)) / a
+        after, left = m * (speed - a * t) / (m + 1.0), 1.0 - t
+        return jnp.stack([(after - 0.5 * a * left) * left, after * left, after - a * left, after])
+
+    x = jnp.array([0.3, 2.0, 1.5, 1.25])
+    np.testing.assert_allclose(run(x), exact(x), atol=1e-12)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(run))(x), jax.jacfwd(exact)(x), atol=1e-9)
+
+
 def test_several_contacts_at_one_instant():
     """A rigid bar falls flat on two supports."""
     bar = HARD["bar_on_two_supports"].task
@@ -297,6 +323,15 @@ def test_an_impact_at_either_end_of_a_run():
     np.testing.assert_allclose(run.qd[-1, 0], 0.5 * 9.81 * fall, rtol=1e-12)
     run = jms.simulate(bouncing_ball.scene(e=0.5), [0.0], [-1.0], 0.05, **TIGHT)
     np.testing.assert_allclose(run.q[-1, 0], 0.5 * 0.05 - 0.5 * 9.81 * 0.05**2, rtol=1e-10)
+
+
+def test_the_loss_of_an_impact_is_in_the_balance_at_a_saved_time_within_rounding_of_it():
+    wall = jms.Contact(lambda t, q, p: q[0], restitution=0.5)
+    scene = jms.Scene(lambda t, q, qd, p: 0.5 * qd[0] ** 2, {}, constraints=(wall,))
+    run = jms.simulate(scene, [0.2], [-1.0], 1.0, ts=0.2 * np.array([0.5, 1.0 - 4e-13, 1.0, 5.0]), **TIGHT)
+    np.testing.assert_allclose(run.qd[:, 0], [-1.0, 0.5, 0.5, 0.5], atol=1e-12)
+    np.testing.assert_allclose(run.event_losses, [0.0, 0.375, 0.375, 0.375], atol=1e-12)
+    np.testing.assert_allclose(run.energy.balance, 0.0, atol=1e-12)
 
 
 def test_a_saved_time_and_an_end_at_an_impact_hold_the_state_after_it():

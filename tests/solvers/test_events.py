@@ -402,6 +402,37 @@ def test_guards_that_fire_together_have_the_derivatives_of_their_own_times() -> 
         np.testing.assert_allclose(slopes, jax.vmap(jax.jacfwd(exact))(heights), rtol=1e-8, atol=1e-8)
 
 
+def test_an_event_that_follows_at_once_has_its_own_time_and_derivative() -> None:
+    """Of three equal balls in a row the first strikes the second; that strikes the third after a small gap."""
+
+    def field(t: Any, s: Any, args: Any) -> Any:
+        return s.rate(jnp.concatenate([s.y[3:], jnp.zeros(3)]))
+
+    def gaps(t: Any, s: Any, args: Any) -> Any:
+        return jnp.diff(s.y[:3])
+
+    def exchange(t: Any, s: Any, args: Any, fired: Any) -> Any:
+        v = s.y[3:]
+        v = jnp.where(fired[0], v[jnp.array([1, 0, 2])], v)
+        return s._replace(y=s.y.at[3:].set(jnp.where(fired[0], v, v[jnp.array([0, 2, 1])])))
+
+    def run(x: Any) -> Any:
+        y0 = jnp.zeros(6).at[jnp.array([0, 2, 3])].set(x * jnp.array([-1.0, 1.0, 1.0]))
+        state = solve(field, gaps, exchange, y0, 1.0).ys
+        return jnp.concatenate([state.y[0], state.log.t[0, :2]])
+
+    def exact(x: Any) -> Any:
+        first, second = x[0] / x[2], (x[0] + x[1]) / x[2]
+        rest = jnp.zeros_like(first)
+        return jnp.stack([rest, x[1], x[1] + x[2] * (1.0 - second), rest, rest, x[2], first, second])
+
+    derivative = jax.jit(jax.jacrev(run))
+    for gap in (1e-2, 1e-7, 1e-9):
+        x = jnp.array([0.3, gap, 2.0])
+        np.testing.assert_allclose(run(x), exact(x), atol=1e-12)
+        np.testing.assert_allclose(derivative(x), jax.jacrev(exact)(x), atol=1e-9)
+
+
 def test_second_derivatives_pass_through_events() -> None:
     """Height at 1.5 s, after two bounces, by the height of the drop and by gravity, against the closed form."""
 

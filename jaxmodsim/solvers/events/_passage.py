@@ -31,7 +31,7 @@ class Landed(NamedTuple):
     - `fall`: the value of that guard at its root, and its rate along the motion; constant.
     - `on_root`: whether it has a root.
     - `near`: the largest distance of the root [time].
-    - `earliest`: lower bound of the time of the event.
+    - `earliest`: lower bound of the time of the event. `chained`: whether it is the time of a reset just before.
     """
 
     t: Float[Array, ""]
@@ -42,6 +42,7 @@ class Landed(NamedTuple):
     on_root: Bool[Array, ""]
     near: Float[Array, ""]
     earliest: Float[Array, ""]
+    chained: Bool[Array, ""]
 
 
 class Passage(NamedTuple):
@@ -105,18 +106,15 @@ def pass_event(
         there = choose(i == _COUNT - 1, args[2], choose(behind, args[1], args[0]))
         rates, guards = evaluate(t, y, mode, there)
         newton = (level - jnp.sum(jnp.where(landed.first, guards, 0.0))) / rate
-        # A guard that a reset has violated fires at the end of the step: it has no root here, or one before the reset.
-        on_root = jnp.where(
-            i == 0,
-            landed.on_root
-            & (jnp.abs(_constant(newton)) <= LATITUDE * landed.near)
-            & _constant(t + newton >= landed.earliest),
-            place.on_root,
-        )
+        # After a reset a guard fires late: at its root since then, or at the reset if that has violated it.
+        back, aim = landed.earliest - landed.t, _constant(newton)
+        reach = (jnp.abs(aim) <= LATITUDE * landed.near) | (landed.chained & (aim <= 0))
+        here = landed.on_root & reach & _constant(t + newton >= landed.earliest)
+        on_root = jnp.where(i == 0, here, place.on_root)
         newton = jnp.where(on_root, newton, 0.0)
-        way = jnp.where(i == 0, newton, place.way)
+        way = jnp.where(i == 0, jnp.where(landed.chained & ~here, back, newton), place.way)
         whole = way + newton
-        whole = jnp.where(_constant(landed.t + whole < landed.earliest), _constant(landed.earliest - landed.t), whole)
+        whole = jnp.where(_constant(landed.t + whole < landed.earliest), back, whole)
         start, length = choose(at_root, ((landed.t, y), newton), (origin, share * way))
         way = jnp.where(at_root, whole, way)
         following = _Place(

@@ -24,6 +24,8 @@ from ._state import ACCUMULATION, ONGOING, TOO_MANY, EventLog, EventMemory, Even
 _LANDING, _LANDING_OF_INTERVAL = 1e-5, 1e-2
 # A step that is at most this part of the last ones counts as one without length: guards vary by their rounding.
 _SHORT = 1e-6
+# Within this part of the last steps after an event a guard without a root is one that the event has violated.
+_CHAIN = 1e-3
 # Events accumulate where the longest of the last intervals is below this part of the time since the start, times the
 # square root of the rounding unit.
 _ACCUMULATION = 1e-3
@@ -88,9 +90,7 @@ class EventSolver(AbstractSolverWrapper):
       fire together, in one call of `reset` with all of them marked in `fired`. Later roots in the same step are
       searched again after the reset.
     - *After an event* the guards that fired wait until they are positive, so that each crossing fires once; other armed
-      guards stay armed. A guard that the reset has made negative therefore fires at once. In such a chain
-      the derivatives treat the times of the later events as constants; a `reset` that does everything in one
-      call has exact derivatives.
+      guards stay armed. A guard that the reset has made negative therefore fires at once, with the time of that event.
     - *With `enforce`* all guards are armed at all times: one that is violated at the start fires at once, and one that
       its own reset leaves violated fires again and again, until the events accumulate.
     - *Within a step* a guard is the cubic through its values at 0, 1/3, 2/3 (from dense output) and 1. Its value at 1/2
@@ -422,7 +422,8 @@ class EventSolver(AbstractSolverWrapper):
             level = jnp.sum(jnp.where(first, root, 0.0))
             arrives = jnp.any(first & (memory.guard > 0))
             early, level = jnp.where(arrives, 0.0, level / jnp.abs(rate)), jnp.where(arrives, level, 0.0)
-            landed = Landed(t, y, mode, first, (level, rate), landing.landed, near, state.t)
+            soon = (near > 0) & (t - _constant(state.t) <= _CHAIN * memory.pace) & (memory.resets > 0)
+            landed = Landed(t, y, mode, first, (level, rate), landing.landed, near, state.t, soon)
             return pass_event(landed, evaluate, (args, back, new_args), reset), slope, (rate, early)
 
         passage, each, (rate, early) = in_turn(way, (t, state.y, state.mode, memory.guard), landing, near)
