@@ -9,7 +9,6 @@ from jaxtyping import Array, Float
 from ..mechanics import energies
 from ..scene import Scene, State
 from ..solvers import EventLog
-from ..solvers.events._guard_scan import instant
 from ._integrated_system import Work
 from ._run_request import RunRequest
 
@@ -80,7 +79,8 @@ def event_losses(
     happened = jnp.isfinite(log.t)
     at = jnp.where(happened, log.t, request.t0)
     drops = jax.vmap(drop)(at, log.before[0], log.after[0])
-    begins = at - instant(4.0 * jnp.finfo(at.dtype).eps * jnp.abs(at))  # states saved from here on are those after it
+    # Saved states are those after an event from this part of its time before it: see `EventSolver`.
+    begins = at - max(0.9e-12, 64.0 * float(jnp.finfo(at.dtype).eps)) * jnp.abs(at)
     counts = happened[None, :] & (begins[None, :] <= t[:, None])
     return lost + jnp.sum(jnp.where(counts, drops[None, :], 0.0), axis=1)
 
