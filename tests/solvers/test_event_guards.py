@@ -55,8 +55,9 @@ def passed(angle: Any) -> Any:
     t, w = jnp.asarray(np.pi / 2 + 1e-5), jnp.ones(())
     y = jnp.stack([jnp.cos(t + angle), -jnp.sin(t + angle)])
     landed = Landed(
-        t, y, w, jnp.array([True]), (jnp.zeros(()), -jnp.ones(())), jnp.asarray(True), jnp.asarray(1e-4), 0 * t
-    )
+        t, y, w, jnp.array([True]), (jnp.zeros(()), -jnp.ones(())), jnp.asarray(True), jnp.asarray(1e-4), 0 * t,
+        jnp.asarray(False),
+    )  # fmt: skip
     passage = pass_event(
         landed,
         lambda t, y, mode, args: (jnp.stack([y[1], -mode * y[0]]), y[:1]),
