@@ -405,7 +405,7 @@ def test_fit_law_refuses_records_with_other_inputs():
     t = np.linspace(0.0, 1.0, 51)
     motion, force = {"x": 1e-3 * np.sin(t)}, np.cos(t)
     loaded = jms.Record(t, force, motion | {"normal": 1.0 + t}, "loaded")
-    with pytest.raises(ValueError, match=r"free has \['x'\], linear \[\], loaded has \['normal', 'x'\]"):
+    with pytest.raises(ValueError, match=r"free has \['x'\], linear \[\]; loaded has \['normal', 'x'\]"):
         jms.fit_law(jms.Dahl(sigma0=1e4, Fc=2.0), [jms.Record(t, force, motion, "free"), loaded])
 
 
