@@ -71,7 +71,7 @@ def main(smoke: bool, out: Path) -> Result | None:
 def _add_thirds(result: Result, record: jms.Record, models: tuple[str, ...], held_out: tuple[str, ...]) -> None:
     """Thirds of the record, each predicted by a fit to the other two as two records."""
     count = len(record.t) // len(THIRDS)
-    parts = {name: _part(record, slice(i * count, (i + 1) * count), name) for i, name in enumerate(THIRDS)}
+    parts = {name: record.samples(i * count, (i + 1) * count, name) for i, name in enumerate(THIRDS)}
     for name in models:
         model = axis_models()[name]
         for held in held_out:
@@ -86,11 +86,6 @@ def _add_thirds(result: Result, record: jms.Record, models: tuple[str, ...], hel
             result.add("expected error", prediction_error(found, agreement=agreed)["measured"].total, "m", **row)
             result.add("half band", float(np.sqrt(np.mean(half**2))), "m", **row)
             result.add("samples in the band", 100 * predicted.shares["measured"], "%", **row)
-
-
-def _part(record: jms.Record, samples: slice, name: str) -> jms.Record:
-    """Some samples of a record."""
-    return jms.Record(record.t[samples], record.measured[samples], {"u": record.inputs["u"][samples]}, name)
 
 
 def _rmse(record: jms.Record, model: str, parameters: dict[str, Any], substeps: int) -> float:
