@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from ..mechanics import energies
 from ..scene import Scene, State
-from ..solvers import EventLog
+from ..solvers import EventLog, instant
 from ._integrated_system import Work
 from ._run_request import RunRequest
 
@@ -79,9 +79,9 @@ def event_losses(
     happened = jnp.isfinite(log.t)
     at = jnp.where(happened, log.t, request.t0)
     drops = jax.vmap(drop)(at, log.before[0], log.after[0])
-    # Saved states are those after an event from this part of its time before it: see `EventSolver`.
-    begins = at - max(0.9e-12, 64.0 * float(jnp.finfo(at.dtype).eps)) * jnp.abs(at)
-    counts = happened[None, :] & (begins[None, :] <= t[:, None])
+    # Saved states are those after an event from an instant before it.
+    resolution = jnp.maximum(4.0 * float(jnp.finfo(at.dtype).eps) * jnp.abs(at), request.shortest_step)
+    counts = happened[None, :] & ((at - instant(resolution))[None, :] <= t[:, None])
     return lost + jnp.sum(jnp.where(counts, drops[None, :], 0.0), axis=1)
 
 

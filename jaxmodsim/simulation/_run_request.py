@@ -88,6 +88,12 @@ class RunRequest(NamedTuple):
         """State at t0; effects without an entry in `z0` start at rest."""
         return State(self.q0, self.qd0, self.scene.initial_state(self.q0) | self.z0)
 
+    @property
+    def shortest_step(self) -> Float[Array, ""]:
+        """Shortest step [s], the resolution of time."""
+        span = jnp.maximum(jnp.abs(self.t0), jnp.abs(self.t1))
+        return float(jnp.finfo(span.dtype).eps) * span
+
     def choosing(self, **choices: Any) -> "RunRequest":
         """The same run with other choices."""
         return self._replace(choices=replace(self.choices, **choices))

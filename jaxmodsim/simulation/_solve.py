@@ -111,12 +111,6 @@ def _structured(request: RunRequest) -> bool:
     return request.q0.shape[0] > 1 and unknowns <= _MOST_UNKNOWNS and has_linear_solver(request.scene)
 
 
-def _shortest(request: RunRequest) -> Float[Array, ""]:
-    """Shortest step [s], the resolution of time."""
-    span = jnp.maximum(jnp.abs(request.t0), jnp.abs(request.t1))
-    return float(jnp.finfo(span.dtype).eps) * span
-
-
 def _tolerances(request: RunRequest) -> tuple[Array, Array]:
     """Relative and absolute tolerance; the latter positive, so that the error of a constant zero is zero, not 0/0."""
     return request.rtol, jnp.maximum(request.atol, float(jnp.finfo(request.atol.dtype).tiny))
@@ -141,7 +135,7 @@ def _solver(
             project=functions.project_and_stick if functions.projects or functions.sticks else None,
             samples=samples,
             rtol=functions.tolerances[0],
-            dtmin=_shortest(request),
+            dtmin=request.shortest_step,
             enforce=True,
             at_event=functions.derivative_and_guards,
             event_mode=functions.event_mode if sum(functions.widths) > len(functions.widths) else None,
@@ -159,7 +153,7 @@ def _step_from(t: Array, scene: Scene) -> Scene:
 
 def _controller(request: RunRequest, solver: dfx.AbstractSolver) -> dfx.AbstractStepSizeController:
     p, i = _ROSENBROCK_GAINS if isinstance(solver, Rodas5P) and not request.scene.mode_names else _GAINS
-    steps = {"dtmin": _shortest(request), "dtmax": request.dtmax, "force_dtmin": False}
+    steps = {"dtmin": request.shortest_step, "dtmax": request.dtmax, "force_dtmin": False}
     adaptive = dfx.PIDController(*_tolerances(request), pcoeff=p, icoeff=i, **steps)
     controller = adaptive if request.dt is None else FiniteSteps()
     times = sample_times(request.scene.params, linear=True)
@@ -247,7 +241,7 @@ def _start(request: RunRequest, functions: RunFunctions, order: Any) -> _Start:
     if request.dt is not None:
         return _Start(y0, mode, slope, request.dt)
     there = jtu.tree_map(lambda x: x[-1], slopes)
-    step = first_step(jax.lax.stop_gradient(y0), (slope, there), order, tolerances, _shortest(request))
+    step = first_step(jax.lax.stop_gradient(y0), (slope, there), order, tolerances, request.shortest_step)
     return _Start(y0, mode, slope, step if request.dtmax is None else jnp.minimum(step, request.dtmax))
 
 

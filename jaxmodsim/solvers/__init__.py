@@ -14,6 +14,7 @@ from ._rosenbrock import RosenbrockTableau as RosenbrockTableau
 from ._rosenbrock import rosenbrock_step as rosenbrock_step
 from ._stored_steps import StoredSteps as StoredSteps
 from .events._controller import EventController as EventController
+from .events._guard_scan import instant as instant
 from .events._samples import SampledJumps as SampledJumps
 from .events._solver import EventSolver as EventSolver
 from .events._state import ACCUMULATION as ACCUMULATION

@@ -332,6 +332,10 @@ def test_the_loss_of_an_impact_is_in_the_balance_at_a_saved_time_within_rounding
     np.testing.assert_allclose(run.qd[:, 0], [-1.0, 0.5, 0.5, 0.5], atol=1e-12)
     np.testing.assert_allclose(run.event_losses, [0.0, 0.375, 0.375, 0.375], atol=1e-12)
     np.testing.assert_allclose(run.energy.balance, 0.0, atol=1e-12)
+    # Early in a run the resolution of time is that of its end.
+    early = jms.simulate(scene, [0.01], [-1.0], 1.0, ts=0.01 * np.array([0.5, 1.0 - 1e-11, 1.0, 5.0]), **TIGHT)
+    np.testing.assert_allclose(early.qd[:, 0], [-1.0, 0.5, 0.5, 0.5], atol=1e-12)
+    np.testing.assert_allclose(early.event_losses, [0.0, 0.375, 0.375, 0.375], atol=1e-12)
 
 
 def test_a_saved_time_and_an_end_at_an_impact_hold_the_state_after_it():
