@@ -117,11 +117,8 @@ def scan_guards(
     high_middle = high1 | (g1 > 0)
     high2 = high_middle | (middle > 0)
     high3 = high2 | (g2 > 0)
-    high_lowest = jnp.where(
-        lowest < 1 / 3,
-        high1,
-        jnp.where(lowest < 1 / 2, high_middle, jnp.where(lowest < 2 / 3, high2, high3)),
-    )
+    high_lowest = jnp.where(lowest < 1 / 2, high_middle, jnp.where(lowest < 2 / 3, high2, high3))
+    high_lowest = jnp.where(lowest < 1 / 3, high1, high_lowest)
     dips = inside & (bottom < -jnp.minimum(error, tolerance)) & high_lowest
     end, low = jnp.ones_like(g0), g3
     crosses = jnp.zeros_like(armed)
@@ -151,15 +148,8 @@ def scan_guards(
     headroom = reduce(jnp.minimum, (jnp.abs(g1), jnp.abs(middle), jnp.abs(g2)))
     headroom = jnp.where(inside & (bottom > 0), jnp.minimum(headroom, bottom), headroom)
     step_factor, landing_factor = _step_factors(jnp.abs(third), error, spread, headroom, tolerance)
-    return GuardScan(
-        high3 | (g3 > 0),
-        crosses,
-        root,
-        ahead,
-        step_factor,
-        landing_factor,
-        (g0, c1, c2, c3),
-    )
+    high, cubic = high3 | (g3 > 0), (g0, c1, c2, c3)
+    return GuardScan(high, crosses, root, ahead, step_factor, landing_factor, cubic)
 
 
 def _step_factors(
@@ -197,7 +187,16 @@ def first_root(scan: GuardScan, passed: Flags) -> Float[Array, ""]:
 
 
 def instant(resolution: Array) -> Array:
-    """Interval [time] before an event within which a saved time counts as that of the event."""
+    """How long before an event a saved time counts as that of the event.
+
+    **Arguments:**
+
+    - `resolution`: that of time, in seconds or in steps, any shape.
+
+    **Returns:**
+
+    The interval, in the unit and the shape of `resolution`.
+    """
     return max(_INSTANT, _INSTANT_OF_ROOT / float(jnp.finfo(resolution.dtype).eps) ** 0.5) * resolution
 
 
