@@ -284,7 +284,7 @@ class _StatementWriter(AbstractScalars):
             x = slices[0]
             for k in range(1, last + 1):
                 beyond = self.apply(jax.lax.ge, "ge", {}, [at, at.dtype.type(k)])
-                x = self.choose(self.parts(beyond), slices[k], x)
+                x = self.choose(_scalar_array(beyond), slices[k], x)
         return x
 
     def scatter_add(self, eqn: JaxprEqn, x: Parts, updates: Parts, places: np.ndarray) -> Parts:

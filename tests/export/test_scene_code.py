@@ -311,6 +311,33 @@ def test_the_text_names_its_numbers_and_allocates_nothing() -> None:
         assert word not in text
 
 
+def library_of(code: str, folder: Path) -> ctypes.CDLL:
+    source, library = folder / "code.c", folder / "code.so"
+    source.write_text(code)
+    subprocess.run([str(COMPILER), *FLAGS, "-shared", "-fPIC", str(source), "-o", str(library)], check=True)
+    return ctypes.CDLL(str(library))
+
+
+def pointers(*arrays: np.ndarray) -> list[Any]:
+    return [a.ctypes.data_as(ctypes.POINTER(ctypes.c_double)) for a in arrays]
+
+
+@needs_compiler
+def test_a_slice_at_a_computed_index_is_that_of_jax(tmp_path: Path) -> None:
+    """JAX moves a slice that begins outside of the array to its first or last place."""
+
+    def part(x: Any, place: Any) -> Any:
+        return (jax.lax.dynamic_slice(x, (place[0].astype(int), place[1].astype(int)), (2, 1)),)
+
+    like = {"x": jnp.zeros((4, 3)), "place": jnp.zeros(2)}
+    code = jms.export.function_to_c(part, like, ("y",), name="part", purpose="A slice.")
+    compiled, x = library_of(code, tmp_path), np.arange(12.0).reshape(4, 3)
+    for place in ([0.0, 0.0], [1.0, 2.0], [2.0, 1.0], [9.0, 9.0], [-9.0, 1.0]):
+        y = np.zeros((2, 1))
+        compiled.part(*pointers(x, np.array(place), y))
+        np.testing.assert_array_equal(y, part(jnp.asarray(x), jnp.array(place))[0])
+
+
 @needs_compiler
 def test_members_of_a_batched_loop_end_on_their_own(tmp_path: Path) -> None:
     def halvings(x: Any) -> Any:
@@ -321,12 +348,8 @@ def test_members_of_a_batched_loop_end_on_their_own(tmp_path: Path) -> None:
 
     like = {"x": jnp.zeros(4)}
     code = jms.export.function_to_c(jax.vmap(halvings), like, ("y", "n"), name="halve", purpose="Halvings.")
-    source, library = tmp_path / "halve.c", tmp_path / "halve.so"
-    source.write_text(code)
-    subprocess.run([str(COMPILER), *FLAGS, "-shared", "-fPIC", str(source), "-o", str(library)], check=True)
     x, y, n = np.array([0.5, 3.0, 1e6, 1e30]), np.zeros(4), np.zeros(4)
-    pointers = [a.ctypes.data_as(ctypes.POINTER(ctypes.c_double)) for a in (x, y, n)]
-    ctypes.CDLL(str(library)).halve(*pointers)
+    library_of(code, tmp_path).halve(*pointers(x, y, n))
     np.testing.assert_array_equal(n, [0, 2, 20, 60])
     np.testing.assert_array_equal(y, x / 2**n)
 
