@@ -102,7 +102,7 @@ def program_of(closed: ClosedJaxpr, arguments: Sequence[Symbol]) -> Program:
     return Program(_needed(writer.block, set(filter(_is_symbol, copied))), copied)
 
 
-def _scalar_array(x: Entry) -> Parts:
+def _scalar_array(x: Value) -> Parts:
     out = np.empty((), object)
     out[()] = x
     return out

@@ -338,6 +338,49 @@ def test_a_slice_at_a_computed_index_is_that_of_jax(tmp_path: Path) -> None:
         np.testing.assert_array_equal(y, part(jnp.asarray(x), jnp.array(place))[0])
 
 
+def swapped(x: Any) -> Any:
+    """A known number of steps, in which each carried value becomes the other."""
+    return jnp.stack(jax.lax.fori_loop(0, 5, lambda _, pair: (pair[1], pair[0] + pair[1]), (x[0, 0], x[0, 1])))
+
+
+def backwards(x: Any) -> Any:
+    """A loop over rows from the last to the first, whose results stand in the order of the rows."""
+    last, rows = jax.lax.scan(lambda carry, row: (0.5 * carry + row, carry * row), x[0], x, reverse=True)
+    return jnp.concatenate([last[None], rows])
+
+
+OPERATIONS: dict[str, Callable[[Any], Any]] = {
+    "argmax": lambda x: jnp.stack([jnp.argmax(x, axis=axis).astype(x.dtype).sum() for axis in (0, 1)]),
+    "argmin": lambda x: jnp.argmin(x, axis=0).astype(x.dtype),
+    "backwards": backwards,
+    "clip": lambda x: jnp.clip(x, -1.0, 2.0),
+    "cumsum": lambda x: jnp.cumsum(x, axis=1),
+    "powers": lambda x: jnp.stack([x**3, x**-2, jnp.square(x), jnp.abs(x) ** 0.7]),
+    "remainder": lambda x: jax.lax.rem(jnp.round(x).astype(int), jnp.array(3)).astype(x.dtype),
+    "roots": lambda x: jax.lax.rsqrt(jnp.abs(x)),
+    "rounded": lambda x: jnp.stack([jnp.round(x), jnp.floor(x), jnp.ceil(x), jnp.sign(x)]),
+    "sigmoid": lambda x: jax.nn.sigmoid(x),
+    "sorted pair": lambda x: jnp.stack([jnp.minimum(x[0], x[1]), jnp.maximum(x[0], x[1])]),
+    "swapped": swapped,
+    "written": lambda x: x.at[1, 2].set(7.0).at[:, 0].add(x[:, 1]),
+}
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", OPERATIONS)
+def test_an_operation_in_c_is_that_of_jax(name: str, tmp_path: Path) -> None:
+    code = jms.export.function_to_c(
+        lambda x: (OPERATIONS[name](x),), {"x": jnp.zeros((3, 4))}, ("y",), name="f", purpose=name
+    )
+    compiled = library_of(code, tmp_path)
+    ties = np.array([[1.0, 1.0, -1.0, 2.5], [1.0, 3.5, -1.0, 0.5], [-0.5, 3.5, 4.0, -2.5]])
+    for x in (ties, *np.random.default_rng(0).normal(0.0, 3.0, (3, 3, 4))):
+        expected = np.asarray(OPERATIONS[name](jnp.asarray(x)))
+        y = np.zeros_like(expected)
+        compiled.f(*pointers(x, y))
+        np.testing.assert_allclose(y, expected, rtol=1e-14)
+
+
 @needs_compiler
 def test_members_of_a_batched_loop_end_on_their_own(tmp_path: Path) -> None:
     def halvings(x: Any) -> Any:
