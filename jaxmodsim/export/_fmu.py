@@ -131,8 +131,7 @@ def fmu(
     run = {"startTime": 0.0, "stopTime": t1, "tolerance": rtol}
     text = describe(path.stem, "TOKEN", variables, guards, run)
     sources = {each: (Path(__file__).parent / each).read_text() for each in _WRITTEN}
-    least = [each.least for each in variables[1 : 1 + len(numbers)]]
-    declared = header(model, numbers, states, kinds, least, RTOL=rtol, ATOL=atol)
+    declared = header(model, numbers, states, kinds, RTOL=rtol, ATOL=atol)
     token = hashlib.sha256("".join([text, declared, functions, *sources.values()]).encode()).hexdigest()
     text = text.replace('"TOKEN"', f'"{token}"', 1)
     sources["model.h"] = (

@@ -1,5 +1,6 @@
 """The equations of a scene as C functions of flat arrays: rates, guards, events, outputs and their derivatives."""
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -9,6 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from .._core.parameters import modules_of, range_checks
 from ..mechanics import motion_equations, project
 from ..scene import Scene, State, forward_dynamics, start, switch, vector_field
 from ..solvers import RODAS5P
@@ -110,6 +112,16 @@ class Model(NamedTuple):
         y = self.on_constraints(t, p, y, m)
         return forward_dynamics(t, y, p, m).stick(m) if p.stick_drifts else y
 
+    def ranges(self, p: Scene) -> list[Array]:
+        """1 for each of the `requirements` that holds, else 0."""
+        return [jnp.where(holds, 1.0, 0.0) for _, module in modules_of(p) for _, holds in range_checks(module)]
+
+    @property
+    def requirements(self) -> list[str]:
+        """Admissible ranges of the numbers, as sentences."""
+        checks = [(path, text) for path, module in modules_of(self.scene) for text, _ in range_checks(module)]
+        return [f"{text} (at scene{path})." for path, text in checks]
+
     def begin(self, t: Array, p: Scene, tol: Array, y: State, m: Array) -> tuple[State, Array]:
         """State and modes at the start of a run."""
         y = self.on_constraints(t, p, y, jnp.zeros_like(m))
@@ -156,6 +168,8 @@ def _routines(model: Model) -> dict[str, tuple[str, tuple[str, ...], str, Callab
         ),
         "start": ("State and modes at the start.", ("t", "p", "tol"), "y m", model.begin),
     }
+    if model.requirements:
+        routines["ranges"] = ("Whether each requirement holds.", ("p",), "out", model.ranges)
     if model.modes:
         routines["guards"] = (
             "Guards, their tolerances, and their values at events.",
@@ -225,23 +239,23 @@ def header(
     numbers: Sequence[float],
     states: Sequence[float],
     kinds: Sequence[int],
-    least: Sequence[float | None],
     **defined: Any,
 ) -> str:
-    """Declarations of model.h up to the prototypes: sizes, start values, limits, and coefficients of Rodas5P."""
+    """Declarations of model.h up to the prototypes: sizes, start values, and coefficients of Rodas5P."""
     widths = model.scene.mode_widths(model.y.q.shape[0])
     stops = np.concatenate([[0], np.cumsum(widths)]).astype(int)
     outputs = sum(int(np.prod(shape)) for shape in series_of(model).values())
     sizes = {"NUMBERS": len(numbers), "STATES": len(states), "MODES": model.modes, "THINGS": len(widths)}
     sizes |= {"EVALUATED": len(states) + model.modes + outputs, "CONTACTS": len(model.scene.contacts)}
-    sizes |= {"PROJECTS": int(model.projects), "GAMMA": repr(RODAS5P.gamma)} | defined
+    requirements = model.requirements
+    sizes |= {"RANGES": len(requirements), "PROJECTS": int(model.projects), "GAMMA": repr(RODAS5P.gamma)} | defined
     lines = [f"#define {name} {value}" for name, value in sizes.items()]
     lines += ["enum { PARAMETER, CONTINUOUS_INPUT, DISCRETE_INPUT };"]
     lines += [
         _array("static const double model_numbers", numbers),
         _array("static const double model_states", states),
         _array("static const int model_kinds", kinds),
-        _array("static const double model_least", [-np.finfo(float).max if x is None else x for x in least]),
+        f"static const char *const model_requirements[] = {{{', '.join(map(json.dumps, [*requirements, '']))}}};",
         _array("static const int model_modes", stops),
         _array("static const double NODE", RODAS5P.nodes),
         _array("static const double TIME", RODAS5P.time),

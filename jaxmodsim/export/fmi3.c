@@ -29,6 +29,9 @@ typedef struct {
 
 #define SELF Instance *c = instance
 #define STATE State *s = &((Instance *)instance)->motion.s
+#define PRESENT \
+  State s;      \
+  if (!present(c, &s)) return fmi3Error
 
 static fmi3Status fail(Instance *c, const char *message) {
   if (c->log) c->log(c->environment, fmi3Error, "error", message);
@@ -127,7 +130,7 @@ fmi3Status fmi3ExitInitializationMode(fmi3Instance instance) {
   SELF;
   STATE;
   if (s->phase != INITIALIZATION) return fail(c, "no initialization mode to exit");
-  motion_start(&c->motion);
+  if (!motion_start(&c->motion)) return fail(c, c->motion.failure);
   s->phase = c->steps && !c->eventMode ? STEP_MODE : EVENT_MODE;
   return fmi3OK;
 }
@@ -172,7 +175,7 @@ static bool events(Motion *m) {
     if (!motion_fire(m)) return false;
     if (back != 0.0) motion_move(m, -back);
   }
-  if (s->changed) motion_start(m);
+  if (s->changed && !motion_start(m)) return false;
   return !motion_due(m, 0.0) || motion_fire(m);
 }
 
@@ -212,7 +215,6 @@ fmi3Status fmi3SetFloat64(fmi3Instance instance, REFERENCES, const fmi3Float64 v
     if (*at == values[i]) continue; /* importers repeat values outside of events */
     if (!settable(c, r)) return no_variable(c, "set at this time", r);
     if (!isfinite(values[i])) return fail(c, "set: the value is not finite");
-    if (r < FIRST_STATE && values[i] < model_least[r - FIRST_NUMBER]) return fail(c, "set: the value is below its minimum");
     if (r < FIRST_STATE && model_kinds[r - FIRST_NUMBER] != CONTINUOUS_INPUT) {
       s->changed = s->phase > INITIALIZATION;
     }
@@ -222,21 +224,27 @@ fmi3Status fmi3SetFloat64(fmi3Instance instance, REFERENCES, const fmi3Float64 v
 }
 
 /* The state with which the motion goes on: modes are decided when the initialization or a change between steps ends. */
-static State present(const Instance *c) {
+static bool present(Instance *c, State *s) {
   Motion m = c->motion;
-  if (m.s.phase == INITIALIZATION || (m.s.phase == STEP_MODE && m.s.changed)) motion_start(&m);
-  else if (m.s.phase == STEP_MODE && !m.s.pending && motion_due(&m, 0.0) && !motion_fire(&m)) return c->motion.s;
-  return m.s;
+  *s = m.s;
+  if (s->phase == INITIALIZATION || (s->phase == STEP_MODE && s->changed)) {
+    if (!motion_start(&m)) return fail(c, m.failure), false;
+  } else if (s->phase == STEP_MODE && !s->pending && motion_due(&m, 0.0) && !motion_fire(&m)) {
+    return true;
+  }
+  *s = m.s;
+  return true;
 }
 
 fmi3Status fmi3GetFloat64(fmi3Instance instance, REFERENCES, fmi3Float64 values[], size_t nValues) {
   SELF;
-  const State s = present(c);
-  bool known = false;
+  State s = c->motion.s;
+  bool begun = false, known = false;
   if (nValues != nReferences) return fail(c, "get: one value for each variable is needed");
   for (size_t i = 0; i < nValues; ++i) {
     const fmi3ValueReference r = references[i];
     if (r >= FIRST_MODE) return no_variable(c, "get Float64", r);
+    if (r >= FIRST_STATE && !begun && !(begun = present(c, &s))) return fmi3Error;
     if (r >= FIRST_EVALUATED && !known) {
       model_evaluate(s.t, s.numbers, s.y, s.mode, c->motion.tolerances, c->evaluated), known = true;
     }
@@ -250,7 +258,7 @@ fmi3Status fmi3GetFloat64(fmi3Instance instance, REFERENCES, fmi3Float64 values[
 
 fmi3Status fmi3GetInt32(fmi3Instance instance, REFERENCES, fmi3Int32 values[], size_t nValues) {
   SELF;
-  const State s = present(c);
+  PRESENT;
   if (nValues != nReferences) return fail(c, "get: one value for each variable is needed");
   for (size_t i = 0; i < nValues; ++i) {
     const fmi3ValueReference r = references[i];
@@ -376,7 +384,7 @@ static bool inside(const fmi3ValueReference references[], size_t n, fmi3ValueRef
 
 fmi3Status fmi3GetDirectionalDerivative(DERIVATIVE) {
   SELF;
-  const State s = present(c);
+  PRESENT;
   CHECK_DERIVATIVE(nKnowns, nUnknowns);
   for (size_t i = 0; i < nKnowns; ++i) c->seed[knowns[i]] += seed[i];
   model_push(s.t, s.numbers, s.y, s.mode, c->motion.tolerances, c->seed[0], c->seed + FIRST_NUMBER,
@@ -390,7 +398,7 @@ fmi3Status fmi3GetDirectionalDerivative(DERIVATIVE) {
 
 fmi3Status fmi3GetAdjointDerivative(DERIVATIVE) {
   SELF;
-  const State s = present(c);
+  PRESENT;
   double direct[STATES] = {0.0};
   CHECK_DERIVATIVE(nUnknowns, nKnowns);
   for (size_t i = 0; i < nUnknowns; ++i) {
@@ -481,7 +489,7 @@ fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 time, fmi3Float64 lengt
   if (!(length > 0.0) || fabs(time - s->t) > 1e-9 * (fabs(time) + length)) {
     return fail(c, "a step begins where the last one ended, and has a positive length");
   }
-  if (s->changed) motion_start(m);
+  if (s->changed && !motion_start(m)) return fail(c, m->failure);
   while (s->t < end) {
     const int outcome = motion_advance(m, end);
     fmi3Boolean stop = false;

@@ -48,12 +48,20 @@ double motion_project(Motion *c, double y[STATES]) {
   return distance;
 }
 
-void motion_start(Motion *c) {
+int motion_start(Motion *c) {
   State *s = &c->s;
+#if RANGES
+  double holds[RANGES];
+  model_ranges(s->numbers, holds);
+  for (int i = 0; i < RANGES; ++i) {
+    if (holds[i] == 0.0) return c->failure = model_requirements[i], 0;
+  }
+#endif
   model_start(s->t, s->numbers, c->tolerances, s->y, s->mode);
   memset(s->waits, 0, sizeof s->waits);
   s->changed = s->pending = 0, s->back = 0.0;
   c->linearised = 0;
+  return 1;
 }
 
 /* ---- steps ---- */

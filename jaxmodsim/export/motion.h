@@ -37,8 +37,8 @@ enum { REACHED, EVENT, FAILED };
 void motion_reset(Motion *c);
 /* Tolerances of s into those of the equations. */
 void motion_tolerances(Motion *c);
-/* Modes for the state and numbers, as at the start of a run. */
-void motion_start(Motion *c);
+/* Modes for the state and numbers, as at the start of a run; false if a number is out of its range. */
+int motion_start(Motion *c);
 /* The state on the constraints, and without slip in stick; its distance from there, in tolerances. */
 double motion_project(Motion *c, double y[STATES]);
 /* Marks the guards whose event is now, or within the time `near`; whether there is one. */

@@ -40,16 +40,29 @@ def test_modes_are_decided_before_the_first_step_and_after_a_jump_of_a_load(tmp_
         by = [place["der(qd[0])"]], [place["friction.Fc"]]
         assert one.getDirectionalDerivative(*by, [1.0]) == one.getAdjointDerivative(*by, [1.0]) == [-np.sign(force)]
 
-    one.instantiate()
-    with pytest.raises(Exception, match="fmi3SetFloat64 failed"):
-        one.setFloat64([place["friction.Fc"]], [-1.0])
+    said: list[bytes] = []
+    one.instantiate(logMessage=lambda _environment, _status, _category, message: said.append(message))
+    # Numbers out of range are refused when they are used: two that limit each other change one after the other.
     one.enterInitializationMode(tolerance=1e-6, startTime=0.0)
+    for name, wrong, right in (("Fc", -1.0, 1.0), ("Fs", 0.5, 1.5)):
+        one.setFloat64([place[f"friction.{name}"]], [wrong])
+        with pytest.raises(Exception, match="fmi3GetFloat64 failed"):
+            one.getFloat64([place["friction"]])
+        with pytest.raises(Exception, match="fmi3ExitInitializationMode failed"):
+            one.exitInitializationMode()
+        one.setFloat64([place[f"friction.{name}"]], [right])
+    assert said[0] == b"Coulomb: Fc must be finite and >= 0 [N] (at scene.effects[1].law)."
+    assert said[-1] == b"Coulomb: Fs must be finite and >= Fc [N] (at scene.effects[1].law)."
     check(1.0, -1.0)
     one.exitInitializationMode()
     check(1.0, -1.0)
     one.setFloat64([place["friction.belt_velocity"]], [1.0])
     check(-1.0, 1.0)
     one.setFloat64([place["friction.belt_velocity"]], [0.0])
+    one.setFloat64([place["friction.Fs"]], [0.5])
+    with pytest.raises(Exception, match="fmi3DoStep failed"):
+        one.doStep(0.0, 0.5)
+    one.setFloat64([place["friction.Fs"]], [1.5])
     one.doStep(0.0, 0.5)
     assert one.getFloat64([place["qd[0]"]]) == [0.0]
     # The load jumps beyond break-away, and falls while friction still sticks.
