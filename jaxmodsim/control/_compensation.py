@@ -123,7 +123,7 @@ def check_observer(law: LuGre, m: float, kp: float, kd: float, ki: float = 0.0, 
 
     **Returns:**
 
-    A `Passivity`: `margin` is the `kd` [N s/m] that could be removed, and `speed` is infinite.
+    A `Passivity`: `margin` is the `kd` [N s/m] that could be removed, -inf if no `kd` helps; `speed` is infinite.
 
     **Raises:**
 
@@ -157,4 +157,6 @@ def check_observer(law: LuGre, m: float, kp: float, kd: float, ki: float = 0.0, 
     if over:
         condition += f" Over-compensation: {level:g} of the friction is compensated, and the rest drives the motion."
     ok = bool(kd >= least and integral and not over and kp > 0)
-    return Passivity(ok, -math.inf if over else float(kd - least), math.inf if ok else 0.0, condition)
+    # Damping does not outweigh too much compensation, an integral that is too strong, or no proportional gain.
+    lost = over or kp == 0 or s0 * kp < s1 * ki
+    return Passivity(ok, -math.inf if lost else float(kd - least), math.inf if ok else 0.0, condition)

@@ -105,6 +105,13 @@ def test_passivity_is_that_of_the_frequency_response():
     assert seen == {True, False}
 
 
+@pytest.mark.parametrize("gains", [(0.4, 2.0, 25.0, 4000.0), (0.4, 0.0, 50.0, 0.0)], ids=["integral", "no stiffness"])
+def test_no_margin_is_left_where_damping_cannot_help(gains):
+    m, kp, _, ki = gains
+    assert not any(check_observer(LAW, m, kp, kd, ki).ok for kd in np.geomspace(1e-3, 1e9, 25))
+    assert check_observer(LAW, *gains).margin == -np.inf
+
+
 def test_the_feedforward_is_that_in_c():
     y = State(jnp.array([0.1]), jnp.array([0.03]), {"friction": jnp.array(1e-4)})
     ours = compensate_friction(JOINT, jnp.zeros(()), jnp.array(H), y)
