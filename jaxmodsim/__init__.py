@@ -192,7 +192,9 @@ def __getattr__(name: str) -> _Any:
     if name in _LATER:
         return _import_module(f"{__name__}.{name}")
     if name not in _FOLDERS:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        # Tracebacks ask whether a similar name of this module was meant.
+        here = _import_module(__name__)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}", name=name, obj=here)
     value = globals()[name] = getattr(_import_module(f"{__name__}.{_FOLDERS[name]}"), name)
     return value
 

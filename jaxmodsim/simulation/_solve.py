@@ -13,15 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._core.compat import programs_of
 from .._core.one_kernel import in_one_kernel
-from ..scene import (
-    Scene,
-    State,
-    check_scene,
-    has_linear_solver,
-    sample_times,
-    signals_of,
-    vector_field,
-)
+from ..scene import Scene, State, check_scene, has_linear_solver, sample_times, signals_of, vector_field
 from ..solvers import (
     EventController,
     EventLog,

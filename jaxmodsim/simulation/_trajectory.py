@@ -416,8 +416,11 @@ def _(run: Trajectory) -> Table:
 def _(events: Events) -> Table:
     if not is_known(events.t) or events.t.ndim != 1:
         return Table(f"Events, times of shape {events.t.shape}", (), [])
-    rows = [(f"{t:.6g}", *words) for t, *words in events._in_words()]
-    return Table(f"{len(rows)} mode changes", ("t [s]", "effect", "before", "after"), rows)
+    changes = events._in_words()
+    rows = [(f"{x.t:.6g}", x.effect, x.before, "impact" if x.after == x.before else x.after) for x in changes]
+    times = len({x.t for x in changes})
+    at = "" if times == len(rows) else f" at {times} times"
+    return Table(f"{len(rows)} mode changes{at}", ("t [s]", "effect", "before", "after"), rows)
 
 
 @table_of.register

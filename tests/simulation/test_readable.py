@@ -105,7 +105,14 @@ def test_events_energy_and_counts_print_in_words_outside_of_traces(run: jms.Traj
     assert energy == "Energy, shape (201,)"
     assert size > 3
     ball = jms.simulate(jms.problems.bouncing_ball.scene(e=0.5), [1.0], [0.0], 1.0)
-    assert str(ball.events).splitlines()[2].split()[1:] == ["floor", "open", "open"]
+    assert str(ball.events).splitlines()[2].split()[1:] == ["floor", "open", "impact"]
+    both = jms.Scene(
+        lambda t, q, qd, p: 0.5 * jnp.sum(qd**2),
+        {},
+        [jms.Friction(jms.Coulomb(1.0), along=lambda q, i=i: q[i], name=f"part_{i}") for i in range(2)],
+    )
+    stopped = jms.simulate(both, [0.0, 0.0], [1.0, 1.0], 2.0)
+    assert str(stopped.events).splitlines()[0] == f"2 mode changes at {stopped.stats['num_events']} times"
     none = jms.simulate(jms.problems.n_link_pendulum.scene(1), [0.1], [0.0], 0.1)
     assert str(none.events) == "0 mode changes"
 
