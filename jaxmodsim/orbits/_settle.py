@@ -165,8 +165,8 @@ def _return_time(ts: np.ndarray, x: np.ndarray, moving: str) -> float:
     near = [int(i) for i in lowest if later[i] < max(_NEAR, 3.0 * np.min(later[lowest]))]
     if not near or later[near[0]] > _FAR:
         raise OrbitError(
-            "The run does not return to an earlier state in the second half of `settle`. Pass a longer `settle`, unless"
-            f" there is no stable orbit here.{moving}"
+            "The run does not return to an earlier state in the second half of `settle`. Pass a longer `settle`. If the"
+            f" motion decays, begin farther from rest: there may be no stable orbit here.{moving}"
         )
     return float((first + near[0] + part[first + near[0]]) * (ts[1] - ts[0]))
 
