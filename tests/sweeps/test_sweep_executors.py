@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -96,3 +97,17 @@ def test_dask_runs_the_chunks_of_a_lost_worker_again(found: xr.Dataset, tmp_path
         again = box_sweep(executor=client, progress=kill, out=tmp_path / "store.zarr")
         assert killed
         assert_same(again, found)
+
+
+def test_the_script_of_the_page_runs_as_it_stands(tmp_path: Path) -> None:
+    """With fewer runs."""
+    pytest.importorskip("distributed")
+    page = (Path(__file__).parents[2] / "docs" / "howto" / "cluster.md").read_text()
+    script = re.search(r"```python\n(.*?)```", page, re.DOTALL)
+    assert script is not None
+    assert script[1].count(", 100)") == 2
+    (tmp_path / "sweep_belt.py").write_text(script[1].replace(", 100)", ", 3)"))
+    command = [sys.executable, "sweep_belt.py"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=300)
+    assert done.stdout.splitlines()[-1].endswith(" m/s")
+    assert xr.open_zarr(tmp_path / "belt.zarr", consolidated=False)["peak"].shape == (3, 3)
