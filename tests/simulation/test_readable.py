@@ -132,3 +132,6 @@ def test_help_and_version() -> None:
     assert set(public) - rooms <= listed
     assert "ts: 'ArrayLike | list[float] | None' = None" in pydoc.plain(pydoc.render_doc(jms.simulate))
     assert jms.__version__.count(".") == 2
+    with pytest.raises(AttributeError, match="'Lugre'") as raised:
+        _ = jms.Lugre  # pyright: ignore[reportAttributeAccessIssue]
+    assert (raised.value.name, raised.value.obj) == ("Lugre", jms)  # of which Python asks: did you mean 'LuGre'?
