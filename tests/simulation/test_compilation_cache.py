@@ -105,10 +105,10 @@ def test_the_next_process_compiles_nothing(tmp_path: Path) -> None:
 
     first, second = process(), process()
     assert first["events"] > 0
-    assert first["cache_hits"] == 0
     assert first["kept"] >= 2, "the run, and its gradient"
     assert second["cache_misses"] == 0
-    assert second["cache_hits"] == first["cache_misses"]
+    # Small programs of one process may be equal: the first one hits what it has just written.
+    assert second["cache_hits"] == first["cache_misses"] + first["cache_hits"]
     assert {name: second[name] for name in ("q", "slope", "kept")} == {
         name: first[name] for name in ("q", "slope", "kept")
     }
