@@ -12,14 +12,9 @@ from jaxtyping import Array, Bool, Float, PyTree
 from .._core.arrays import PerDof, Scalar, apply_matrix
 from .._core.cholesky import factor_positive_definite
 from .._core.functions import depends_on
+from .._core.readable import short
 from .._core.scalarise import in_scalars
-from ..mechanics import (
-    Contact,
-    LinearizedConstraints,
-    linearize_constraints,
-    motion_equations,
-    parts,
-)
+from ..mechanics import Contact, LinearizedConstraints, linearize_constraints, motion_equations, parts
 from ._event_driven import (
     FrictionElements,
     FrictionForces,
@@ -84,6 +79,10 @@ class ConstraintReaction(NamedTuple):
     multiplier: Float[Array, "*time m"]
     generalised: Float[Array, "*time dof"]
     force: Any
+
+    def __repr__(self) -> str:
+        given = (f"{name}: {short(x)}" for name, x in zip(self._fields, self, strict=True) if x is not None)
+        return f"{type(self).__name__}({'; '.join(given)})"
 
 
 class Dynamics(NamedTuple):

@@ -123,6 +123,14 @@ def test_a_notebook_shows_tables(run: jms.Trajectory) -> None:
         assert f"<td style='text-align:left'>{text}</td>" in shown["text/html"]
 
 
+def test_reactions_print_their_ranges() -> None:
+    floor = jms.Contact(lambda t, q, p: q[0], name="floor")
+    ball = jms.Scene(lambda t, q, qd, p: 0.5 * qd[0] ** 2 - 9.81 * q[0], {}, constraints=(floor,))
+    reaction = jms.simulate(ball, [0.0], [0.0], 1.0, ts=np.linspace(0.0, 1.0, 11)).reactions["floor"]
+    ranges = "shape (11, 1), 9.81 to 9.81"
+    assert str(reaction) == repr(reaction) == f"ConstraintReaction(multiplier: {ranges}; generalised: {ranges})"
+
+
 @pytest.mark.quick
 def test_help_and_version() -> None:
     text = pydoc.plain(pydoc.render_doc(jms))
