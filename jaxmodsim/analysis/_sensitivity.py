@@ -53,11 +53,11 @@ class Sensitivity:
     ```python
     scene = jms.problems.braked_spring.scene()
     result = jms.sensitivity(scene, "q[0]", q0=[1.0], qd0=[0.0], t1=5.0, ts=jnp.linspace(0.0, 5.0, 101))
-    print([f"{name}: {rms:.3f}" for name, rms in result.ranking])
+    print(sorted(f"{name}: {rms:.3f}" for name, rms in result.ranking))
     ```
 
     ```text
-    ['m: 1.822', 'k: 1.822']
+    ['k: 1.822', 'm: 1.822']
     ```
     """
 
