@@ -59,6 +59,8 @@ def run(source: Path) -> None:
         client.execute(cwd=folder)
     after = os.times()
     for cell in notebook.cells:
+        if cell.source.startswith("%pip"):  # it says that the kernel may need another start
+            cell.outputs = []
         errors = [output for output in cell.get("outputs", ()) if output.get("name") == "stderr"]
         for line in "".join(output.text for output in errors).splitlines():
             if not line.startswith(_SAID):

@@ -5,6 +5,9 @@
 # angle of the motor and the position of the carriage. The torque comes from a CSV file.
 
 # %%
+# %pip install -q "jaxmodsim[notebook]"
+
+# %%
 import jax
 import jax.numpy as jnp
 import numpy as np

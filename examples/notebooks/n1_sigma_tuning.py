@@ -5,6 +5,9 @@
 # rises by 1 N each second: at 1 N it has moved by 1 mm, and it does not ring. Adam of optax finds the numbers.
 
 # %%
+# %pip install -q "jaxmodsim[notebook]"
+
+# %%
 import jax
 import jax.numpy as jnp
 import optax

@@ -5,6 +5,9 @@
 # heavy is it, and what friction does it have?
 
 # %%
+# %pip install -q "jaxmodsim[notebook]"
+
+# %%
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -5,6 +5,9 @@
 # slips, at others it slides on. Two numbers of the machine are varied, and each run is one cell of a map.
 
 # %%
+# %pip install -q "jaxmodsim[notebook]"
+
+# %%
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -5,6 +5,9 @@
 # run. Nothing is reduced by hand.
 
 # %%
+# %pip install -q "jaxmodsim[notebook]"
+
+# %%
 import jax
 import jax.numpy as jnp
 

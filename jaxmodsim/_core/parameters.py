@@ -270,14 +270,15 @@ def ranges_of(module: eqx.Module) -> dict[str, Range]:
     }
 
 
-def range_checks(module: eqx.Module) -> list[tuple[str, Array]]:
-    """For each parameter of `module`: the requirement as a sentence, and whether it holds."""
-    values = {name: nominal(getattr(module, name)) for name in ranges_of(module)}
-    owner = type(module).__name__
-    return [
-        (f"{owner}: {name} must be {allowed.text}", jnp.all(allowed.holds(values[name], values)))
-        for name, allowed in ranges_of(module).items()
-    ]
+def range_checks(scene: object) -> list[tuple[str, Array]]:
+    """For each parameter of each module in `scene`: the requirement as a sentence, and whether it holds."""
+    checks = []
+    for path, module in modules_of(scene):
+        values = {name: nominal(getattr(module, name)) for name in ranges_of(module)}
+        for name, allowed in ranges_of(module).items():
+            text = f"{type(module).__name__}: {name} must be {allowed.text} (at scene{path})."
+            checks.append((text, jnp.all(allowed.holds(values[name], values))))
+    return checks
 
 
 def check_ranges(module: eqx.Module) -> None:

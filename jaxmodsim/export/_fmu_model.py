@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .._core.parameters import modules_of, range_checks
+from .._core.parameters import range_checks
 from ..mechanics import motion_equations, project
 from ..scene import Scene, State, forward_dynamics, start, switch, vector_field
 from ..solvers import RODAS5P
@@ -114,13 +114,12 @@ class Model(NamedTuple):
 
     def ranges(self, p: Scene) -> list[Array]:
         """1 for each of the `requirements` that holds, else 0."""
-        return [jnp.where(holds, 1.0, 0.0) for _, module in modules_of(p) for _, holds in range_checks(module)]
+        return [jnp.where(holds, 1.0, 0.0) for _, holds in range_checks(p)]
 
     @property
     def requirements(self) -> list[str]:
         """Admissible ranges of the numbers, as sentences."""
-        checks = [(path, text) for path, module in modules_of(self.scene) for text, _ in range_checks(module)]
-        return [f"{text} (at scene{path})." for path, text in checks]
+        return [text for text, _ in range_checks(self.scene)]
 
     def begin(self, t: Array, p: Scene, tol: Array, y: State, m: Array) -> tuple[State, Array]:
         """State and modes at the start of a run."""

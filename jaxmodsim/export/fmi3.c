@@ -229,6 +229,8 @@ static bool present(Instance *c, State *s) {
   *s = m.s;
   if (s->phase == INITIALIZATION || (s->phase == STEP_MODE && s->changed)) {
     if (!motion_start(&m)) return fail(c, m.failure), false;
+  } else if (s->changed && !motion_admits(&m)) {
+    return fail(c, m.failure), false;
   } else if (s->phase == STEP_MODE && !s->pending && motion_due(&m, 0.0) && !motion_fire(&m)) {
     return true;
   }
@@ -437,6 +439,7 @@ fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance instance, fmi3Float64 
   SELF;
   STATE;
   if (n != STATES) return fail(c, "the number of continuous states is another one");
+  if (s->changed && !motion_admits(&c->motion)) return fail(c, c->motion.failure);
   model_rate(s->t, s->numbers, s->y, s->mode, derivatives);
   for (int i = 0; i < STATES; ++i) {
     if (!isfinite(derivatives[i])) return fmi3Discard; /* the importer may try a shorter step */
@@ -449,6 +452,7 @@ fmi3Status fmi3GetEventIndicators(fmi3Instance instance, fmi3Float64 indicators[
   if (n != MODES) return fail(c, "the number of event indicators is another one");
 #if MODES
   STATE;
+  if (s->changed && !motion_admits(&c->motion)) return fail(c, c->motion.failure);
   model_guards(s->t, s->numbers, s->y, s->mode, c->motion.tolerances, c->motion.guards[0]);
   memcpy(indicators, c->motion.guards[0], MODES * sizeof(double));
 #endif

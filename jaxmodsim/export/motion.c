@@ -48,15 +48,21 @@ double motion_project(Motion *c, double y[STATES]) {
   return distance;
 }
 
-int motion_start(Motion *c) {
-  State *s = &c->s;
+int motion_admits(Motion *c) {
+  (void)c;
 #if RANGES
   double holds[RANGES];
-  model_ranges(s->numbers, holds);
+  model_ranges(c->s.numbers, holds);
   for (int i = 0; i < RANGES; ++i) {
     if (holds[i] == 0.0) return c->failure = model_requirements[i], 0;
   }
 #endif
+  return 1;
+}
+
+int motion_start(Motion *c) {
+  State *s = &c->s;
+  if (!motion_admits(c)) return 0;
   model_start(s->t, s->numbers, c->tolerances, s->y, s->mode);
   memset(s->waits, 0, sizeof s->waits);
   s->changed = s->pending = 0, s->back = 0.0;

@@ -37,6 +37,8 @@ enum { REACHED, EVENT, FAILED };
 void motion_reset(Motion *c);
 /* Tolerances of s into those of the equations. */
 void motion_tolerances(Motion *c);
+/* Whether the numbers are in their ranges; if not, `failure` says which is needed. */
+int motion_admits(Motion *c);
 /* Modes for the state and numbers, as at the start of a run; false if a number is out of its range. */
 int motion_start(Motion *c);
 /* The state on the constraints, and without slip in stick; its distance from there, in tolerances. */

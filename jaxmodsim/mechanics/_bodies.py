@@ -43,16 +43,19 @@ class AbstractBody(eqx.Module):
 
 
 class Bodies(AbstractBody):
-    """A sum of Lagrangians, by name."""
+    """A sum of Lagrangians, by name; `gravity` is that of all bodies, where each has the same number."""
 
     parts: dict[str, Callable[..., Any]]
+    gravity: ScalarOrFn | None
 
     def __call__(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Scalar:
         """Sum of the Lagrangians [J]."""
-        first, *others = (self.parts[name](t, q, qd, params) for name in sorted(self.parts))
-        for each in others:
-            first = first + each
-        return first
+        first, *others = (part(t, q, qd, params) for _, part in sorted(self.alone().items()))
+        return sum(others, first)
+
+    def alone(self) -> dict[str, Callable[..., Any]]:
+        """The terms, each body with its gravity."""
+        return self.parts if self.gravity is None else _in_gravity(self.parts, self.gravity)
 
 
 def _sum(*terms: Any) -> Bodies:
@@ -60,10 +63,18 @@ def _sum(*terms: Any) -> Bodies:
     parts: dict[str, Callable[..., Any]] = {}
     for term in terms:
         added = as_function(term, name="The term added to a body")
-        for name, part in added.parts.items() if isinstance(added, Bodies) else [(_name(term), added)]:
+        for name, part in added.alone().items() if isinstance(added, Bodies) else [(_name(term), added)]:
             names = (name, *(f"{name}_{i}" for i in range(2, len(parts) + 2)))
             parts[next(each for each in names if each not in parts)] = part
-    return Bodies(parts)
+    own: list[Any] = [x.gravity.amount for x in parts.values() if isinstance(x, PointMass | RigidBody)]
+    one = bool(own) and all(is_known(x) and x == own[0] for x in own)
+    return Bodies(_in_gravity(parts, None), ScalarOrFn(own[0])) if one else Bodies(parts, None)
+
+
+def _in_gravity(parts: dict[str, Any], gravity: ScalarOrFn | None) -> dict[str, Any]:
+    """`parts` whose bodies have this gravity."""
+    put = partial(eqx.tree_at, lambda body: body.gravity, replace=gravity, is_leaf=lambda x: x is None)
+    return {name: put(x) if isinstance(x, PointMass | RigidBody) else x for name, x in parts.items()}
 
 
 def _name(term: Any) -> str:
@@ -121,7 +132,8 @@ def point_mass(m: Any, position: Any, gravity: Any = _ON_EARTH, name: str | None
 
     - `m`: mass [kg], > 0, or a function `m(params)`, so that several functions can share a number in `params`.
     - `position`: `position(q)` or `position(q, params)` in space [m], shape `[3]`, z upwards.
-    - `gravity`: acceleration [m/s^2] along -z, or a function of `params`; by default 9.81.
+    - `gravity`: acceleration [m/s^2] along -z, or a function of `params`; by default 9.81. A sum of bodies with the
+      same number has one, `lagrangian.gravity`.
     - `name`: in a sum of bodies, the numbers of this one are `lagrangian.parts.NAME.m` and so on; by default
       "point_mass", and "point_mass_2" for the second.
 

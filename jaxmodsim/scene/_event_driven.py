@@ -464,25 +464,28 @@ def next_modes(
     - `at_limit`: sticking elements that have reached a limit, and slip in the direction of their load.
     - `rest`: speed of rest [m/s].
     """
-    elements = jax.tree.map(_constant, elements)
     n = mode.shape[0]
     wider = 1.0 + 16.0 * float(jnp.finfo(mode.dtype).eps)
-    before = solve_friction_forces(elements, mode)
+    # In a plane the derivative of the direction matters: slip that begins follows the load at once, while its rate,
+    # friction over speed, is larger than any step resolves.
+    elements, differentiable = jax.tree.map(_constant, elements), elements
+    before = solve_friction_forces(differentiable if elements.planes else elements, mode)
     # The direction is that of the nearer limit, which may be zero in one direction (a freewheel).
     load = elements.onset_mode((before.force - 0.5 * (before.upper - before.lower))[:n], rest)
     mode = jnp.where(still, jnp.where(at_limit, load, jnp.zeros_like(mode)), mode)
     scale = 1e-6 * jnp.max(jnp.abs(elements.delassus) * jnp.maximum(before.upper, before.lower)[None, :], axis=1)[:n]
 
     def improve(i: Array, mode: Array) -> Array:
-        all_forces, upper, lower, _ = solve_friction_forces(elements, mode, still)
+        now = _constant(mode)
+        all_forces, upper, lower, _ = solve_friction_forces(elements, now, still)
         force = all_forces[:n]
         limit = jnp.where(force > 0, upper[:n], lower[:n])
         least = float(jnp.finfo(limit.dtype).tiny)
-        use = jnp.where(elements.sticks(mode), elements.magnitude(force) / jnp.maximum(limit, least), 0.0)
+        use = jnp.where(elements.sticks(now), elements.magnitude(force) / jnp.maximum(limit, least), 0.0)
         worst = (use == jnp.max(use)) & (use > wider)
         acceleration = (elements.free_slip_acceleration - jnp.sum(elements.delassus * all_forces[None, :], axis=1))[:n]
         in_direction = elements.in_planes(
-            mode * acceleration, lambda part: jnp.sum(_unit(mode[part]) * acceleration[part])
+            now * acceleration, lambda part: jnp.sum(_unit(now[part]) * acceleration[part])
         )
         # Where no modes are consistent, end with a slip that ends at once, which shows as chatter, and not with a stick
         # above its limit.

@@ -12,9 +12,12 @@ from ._names import scene_numbers, scene_units
 from ._scene import Scene
 from .forces._friction import Friction
 
+# A gradient has the structure of its scene: the unit belongs to the number, not to the value in the table.
+_HEAD = "number [unit]", "value"
+
 
 def _numbers(thing: eqx.Module) -> list[tuple[str, ...]]:
-    """Each number by its name and unit. A derivative has the name and the unit of its number."""
+    """Each number by its name and unit."""
     units = scene_units(thing)
     return [(Quantity(name, units.get(name, "")).label, short(x)) for name, x in scene_numbers(thing).items()]
 
@@ -29,7 +32,7 @@ def _called(law: AbstractLaw) -> str:
 
 @table_of.register
 def _(law: AbstractLaw) -> Table:
-    return Table(f"{_called(law)}: {law.description}".rstrip(": "), ("number", "value"), _numbers(law))
+    return Table(f"{_called(law)}: {law.description}".rstrip(": "), _HEAD, _numbers(law))
 
 
 @table_of.register
@@ -48,4 +51,4 @@ def _(scene: Scene) -> Table:
         for kind, named in parts.items()
         if named
     )
-    return Table(shorten(title, 110, placeholder=" ..."), ("number", "value"), _numbers(scene), notes)
+    return Table(shorten(title, 110, placeholder=" ..."), _HEAD, _numbers(scene), notes)

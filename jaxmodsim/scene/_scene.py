@@ -137,7 +137,7 @@ class Scene(AbstractReadable, eqx.Module):
 
     ```text
     Scene of pendulum in phi [rad]
-      number                       value
+      number [unit]                value
       l                            0.5
       m                            1
       hinge.Fc [N m]               0.1

@@ -86,7 +86,7 @@ class _Offsets(NamedTuple):
 
 def _offsets(scene: Scene, dof: int) -> _Offsets:
     ranges = FIRST_MASS + dof
-    chatter = ranges + sum(len(range_checks(module)) for _, module in modules_of(scene))
+    chatter = ranges + len(range_checks(scene))
     checks = chatter + sum(scene.mode_widths(dof))
     return _Offsets(ranges, chatter, checks, checks + len(scene.checks))
 
@@ -159,9 +159,7 @@ def outcome_messages(scene: Scene, dof: int) -> tuple[str, ...]:
         " not positive" + (" once the motion of the coordinates before it is taken out." if i else ".")
         for i in range(dof)
     )
-    ranges = tuple(
-        f"{text} (at scene{path})." for path, module in modules_of(scene) for text, _ in range_checks(module)
-    )
+    ranges = tuple(text for text, _ in range_checks(scene))
     general: list[str] = list(_GENERAL)
     laws = [module for _, module in modules_of(scene) if isinstance(module, DeadZone | Sign)]
     for code, asked in ((MAX_STEPS, bool(laws or not scene.contacts)), (STEP_TOO_SMALL, bool(laws))):
@@ -241,8 +239,7 @@ def start_code(
         code = jnp.where(atol <= jnp.min(jnp.stack([jnp.min(width) for width in widths])), code, TOO_NARROW)
     for i, fn in enumerate(_load_functions(scene).values()):
         code = jnp.where(_has_load(fn, scene, t, y), code, offsets.loads + i)
-    checks = [ok for _, module in modules_of(scene) for _, ok in range_checks(module)]
-    for i, ok in reversed(list(enumerate(checks))):
+    for i, (_, ok) in reversed(list(enumerate(range_checks(scene)))):
         code = jnp.where(ok, code, offsets.ranges + i)
     return code
 

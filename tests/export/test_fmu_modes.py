@@ -71,3 +71,38 @@ def test_modes_are_decided_before_the_first_step_and_after_a_jump_of_a_load(tmp_
     one.doStep(0.5, 0.5)
     assert one.getFloat64([place["qd[0]"]]) == pytest.approx([1.625])
     one.freeInstance()
+
+
+@needs_fmpy
+def test_an_input_out_of_range_between_events_of_model_exchange_is_refused(tmp_path: Path) -> None:
+
+    from fmpy.fmi3 import FMU3Model, fmi3Float64
+
+    scene = jms.Scene(lambda t, q, qd, p: 0.5 * qd[0] ** 2, effects=(jms.Friction(jms.Coulomb(1.0, 1.5)),))
+    path = jms.export.fmu(scene, [0.0], [0.3], tmp_path / "box.fmu", inputs=["friction.Fs"], platforms=[OWN])
+    description = fmpy.read_model_description(str(path))
+    place = {each.name: each.valueReference for each in description.modelVariables}
+    one = FMU3Model(
+        guid=description.guid, unzipDirectory=fmpy.extract(str(path), str(tmp_path / "box")),
+        modelIdentifier="box", instanceName="one",
+    )  # fmt: skip
+    said: list[bytes] = []
+    one.instantiate(logMessage=lambda _environment, _status, _category, message: said.append(message))
+    one.enterInitializationMode(tolerance=1e-6, startTime=0.0)
+    one.exitInitializationMode()
+    one.updateDiscreteStates()
+    one.enterContinuousTimeMode()
+    rates, guards = (fmi3Float64 * 2)(), (fmi3Float64 * 1)()
+    one.setFloat64([place["friction.Fs"]], [0.5])
+    for use in (
+        lambda: one.getContinuousStateDerivatives(rates, 2),
+        lambda: one.getEventIndicators(guards, 1),
+        lambda: one.getFloat64([place["friction"]]),
+    ):
+        with pytest.raises(Exception, match="failed"):
+            use()
+    assert said == 3 * [b"Coulomb: Fs must be finite and >= Fc [N] (at scene.effects[0].law)."]
+    one.setFloat64([place["friction.Fs"]], [1.5])
+    one.getContinuousStateDerivatives(rates, 2)
+    assert list(rates) == [0.3, -1.0]
+    one.freeInstance()

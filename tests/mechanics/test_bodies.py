@@ -217,6 +217,19 @@ def test_numbers_of_a_sum_have_the_names_of_their_bodies() -> None:
         assert {k: float(x) for k, x in numbers.items() if k.endswith("m")} == {
             f"lagrangian.parts.{name}.m": m for name, m in masses.items()
         }
+        # Each body has the gravity of the sum.
+        gravity = {k: float(x) for k, x in numbers.items() if k.endswith("gravity")}
+        assert gravity == {"lagrangian.gravity": 9.81}
+        here = jnp.array([0.4, 0.1]), jnp.array([1.0, 2.0])
+        np.testing.assert_allclose(
+            (total + bob)(ZERO, *here, {}),
+            sum(each(ZERO, *here, {}) for each in (body, bob, rod, body, bob)),
+            rtol=1e-14,
+        )
+    # Bodies with several gravities, or one that is a function of `params`, keep them.
+    for other in (1.62, lambda p: p["g"]):
+        numbers = scene_numbers(Scene(body + bob + point_mass(1.0, line, gravity=other, name="moon"), {"g": 9.81}))
+        assert {"lagrangian.parts.bob.gravity", "lagrangian.parts.point_mass.gravity"} <= {*numbers}
     # Terms without a name that can be written are terms.
     assert list((bob + (lambda t, q, qd, p: 0.0 * q[0]) + bob).parts) == ["bob", "term", "bob_2"]
 

@@ -141,6 +141,38 @@ def test_on_a_line_it_is_the_scalar_law(law: Any) -> None:
         np.testing.assert_allclose(plane.mode_changes[0].t, scalar.mode_changes[0].t, rtol=1e-12)
 
 
+def sprung(t: Any, q: Any, qd: Any, p: Any) -> Any:
+    del t, p
+    return 0.5 * jnp.sum(qd**2) - 0.5 * jnp.sum(q**2)
+
+
+def turning_load(t: Any, q: Any, qd: Any, p: Any) -> Any:
+    del q, qd
+    return jnp.stack([jnp.sin(0.35 * t), p["across"] * jnp.cos(0.35 * t)])
+
+
+def test_derivatives_through_break_aways_are_those_of_differences() -> None:
+    """Slip that begins follows the load at a rate, friction over speed, that has no bound."""
+    effects = (AppliedForce(turning_load), Friction(Coulomb(0.5), along=place))
+    scene = Scene(sprung, params={"across": 0.3}, effects=effects)
+
+    def end(q0: Any, across: Any, rtol: float) -> Any:
+        here = eqx.tree_at(lambda s: s.params["across"], scene, across)
+        return simulate(here, q0, [0.0, 0.0], 20.0, rtol=rtol, atol=1e-2 * rtol, throw=False)
+
+    q0, h = jnp.array([-0.05, 0.02]), 1e-5
+    tight = jax.jit(lambda q0, across: end(q0, across, 1e-12))
+    slopes = jax.jit(jax.jacfwd(lambda q0, across: end(q0, across, 1e-9).q[-1], argnums=(0, 1)))
+    assert tight(q0, 0.3).stats["num_events"] == 5
+    by_q0 = [(tight(q0 + h * e, 0.3).q - tight(q0 - h * e, 0.3).q)[-1] / (2 * h) for e in np.eye(2)]
+    by_across = (tight(q0, 0.3 + h).q - tight(q0, 0.3 - h).q)[-1] / (2 * h)
+    np.testing.assert_allclose(slopes(q0, 0.3)[0], np.stack(by_q0, axis=1), atol=1e-7)
+    np.testing.assert_allclose(slopes(q0, 0.3)[1], by_across, atol=1e-7)
+    # On a line the motion along it does not depend, to first order, on the place across it.
+    on_line = slopes(jnp.array([-0.05, 0.0]), 0.0)[0]
+    np.testing.assert_allclose(on_line[[0, 1], [1, 0]], 0.0, atol=1e-10)
+
+
 def test_forces_turn_with_the_frame() -> None:
     """Stick and slip, at rest and at all speeds, in twenty frames."""
     rng, scene = np.random.default_rng(0), puck(Stribeck(1.0, 2.0, 0.3, 0.4))

@@ -103,6 +103,7 @@ def test_the_next_process_compiles_nothing(tmp_path: Path) -> None:
         done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
         return json.loads(done.stdout.splitlines()[-1])
 
+    assert not [*tmp_path.iterdir()], "the first process finds nothing"
     first, second = process(), process()
     assert first["events"] > 0
     assert first["kept"] >= 2, "the run, and its gradient"

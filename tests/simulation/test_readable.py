@@ -50,11 +50,11 @@ def test_a_scene_and_its_gradient_print_names_values_and_units() -> None:
 
 
 def test_a_law_prints_its_parameters() -> None:
-    assert str(jms.Coulomb(5.0, 8.0)).splitlines()[2:] == ["  Fc [N]  5", "  Fs [N]  8"]
+    assert str(jms.Coulomb(5.0, 8.0)).splitlines()[2:] == ["  Fc [N]         5", "  Fs [N]         8"]
     assert str(jms.asymmetric(jms.Coulomb(1.0), Fc=2.0)).startswith("asymmetric(Coulomb)\n")
     wrapped = str(jms.Regularized(jms.Coulomb(1.0), width=1e-3))
     assert wrapped.startswith("Regularized(Coulomb): smooth")
-    assert "width [m/s]  0.001" in wrapped
+    assert "width [m/s]    0.001" in wrapped
     assert "[0.1, 0.2]" in str(jms.MaxwellSlip(k=[1.0, 2.0], Fc=[0.1, 0.2]))
 
 

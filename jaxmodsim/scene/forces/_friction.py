@@ -354,17 +354,17 @@ class Friction(AbstractEffect):
 
         A trial step may run past the end of the slip. On a line through rest slip and force continue as those of a
         scalar slip, with the sign of the component of `v` along `reference`, an earlier velocity. If that component is
-        below 1e-2 of `reference`, the direction of the force changes smoothly to that of `reference`, so that the force
-        is a smooth function of `v` at rest, too.
+        below 1e-2 of `reference`, the direction of the force changes smoothly to that of `reference`: the force has two
+        continuous derivatives, as the error of the first one limits the steps of a run with derivatives.
         """
         speed = safe_norm(reference)
         direction = reference / jnp.where(speed > 0, speed, 1.0)
         none = _FLOOR * jnp.where(speed > 0, speed, 1.0)
         along = jnp.sum(v * direction)
-        slips = jnp.abs(along) > none
-        inverse = jnp.where(
-            slips, 1.0 / jnp.where(slips, along, 1.0), (1.0 + 2.0 * jnp.minimum(along, 0.0) / none) / none
-        )
+        part = along / none
+        slips = jnp.abs(part) > 1.0
+        far, near = jnp.where(slips, part, 1.0), jnp.where(slips, 0.0, part)
+        inverse = jnp.where(slips, 1.0 / far, near * (3.0 - near * near * (3.0 - near * near))) / none
         tangent = (v - along * direction) * inverse
         slant = jnp.sqrt(1.0 + jnp.sum(tangent * tangent))
         return self.slip_force(along * slant, jnp.ones_like(along), load) / slant * (direction + tangent)
