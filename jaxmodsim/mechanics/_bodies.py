@@ -2,7 +2,8 @@
 
 import abc
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
+from operator import add
 from typing import Any
 
 import equinox as eqx
@@ -50,8 +51,7 @@ class Bodies(AbstractBody):
 
     def __call__(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Scalar:
         """Sum of the Lagrangians [J]."""
-        first, *others = (part(t, q, qd, params) for _, part in sorted(self.alone().items()))
-        return sum(others, first)
+        return reduce(add, (part(t, q, qd, params) for _, part in sorted(self.alone().items())))
 
     def alone(self) -> dict[str, Callable[..., Any]]:
         """The terms, each body with its gravity."""
