@@ -49,14 +49,19 @@ def test_a_line_of_the_user_is_named(tmp_path: Path) -> None:
 
 
 def test_a_long_compilation_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
+    speed.advise_about_compilation.cache_clear()
     speed.warn_about_compilation(2.9, ())
     assert not caplog.records
     speed.warn_about_compilation(3.1, ())
-    assert "Compiling this scene took 3.1 s" in caplog.text
-    assert '("jax_compilation_cache_dir", "/path/of/a/folder")' in caplog.text
+    assert caplog.messages[0] == "Compiling this scene took 3.1 s."
+    assert '("jax_compilation_cache_dir", "/path/of/a/folder")' in caplog.messages[1]
+    # The second scene has its time, without the advice.
+    speed.warn_about_compilation(4.0, ())
+    assert caplog.messages[2:] == ["Compiling this scene took 4.0 s."]
 
 
 def test_whoever_keeps_programs_is_not_told_how(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
+    speed.advise_about_compilation.cache_clear()
     before = jax.config.values["jax_compilation_cache_dir"]
     try:
         jax.config.update("jax_compilation_cache_dir", str(tmp_path))

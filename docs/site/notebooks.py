@@ -20,7 +20,7 @@ import nbformat
 ROOT = Path(__file__).resolve().parents[2]
 CACHE = ROOT / "build" / "notebooks"
 # What the package logs, which depends on how fast the machine is.
-_SAID = "Compiling this scene took"
+_SAID = "Compiling this scene took", "Further runs of a scene start at once"
 
 
 @dataclass(frozen=True)

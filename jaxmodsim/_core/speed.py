@@ -111,6 +111,16 @@ def warn_about_fixed_steps(solver: str, dt: float, most: float) -> None:
     )
 
 
+@cache
+def advise_about_compilation() -> None:
+    """Say once what compiles again, and how to keep programs."""
+    _LOG.warning(
+        "Further runs of a scene start at once, also with other numbers. Another structure, another solver, or another"
+        " length of `ts` compiles again.%s logging.getLogger('jaxmodsim').setLevel('ERROR') disables such messages.",
+        "" if jax.config.values["jax_compilation_cache_dir"] else _KEEP,
+    )
+
+
 def warn_about_compilation(seconds: float, functions: Iterable[object]) -> None:
     """Warn about a long compilation, and about a function that is compiled repeatedly because each one is new.
 
@@ -120,13 +130,8 @@ def warn_about_compilation(seconds: float, functions: Iterable[object]) -> None:
     - `functions`: functions of the compiled scene.
     """
     if seconds > _LONG:
-        _LOG.warning(
-            "Compiling this scene took %.1f s. Further runs of it start at once, also with other numbers. Another"
-            " structure of the scene, another solver, or another length of `ts` compiles again.%s"
-            " logging.getLogger('jaxmodsim').setLevel('ERROR') disables such messages.",
-            seconds,
-            "" if jax.config.values["jax_compilation_cache_dir"] else _KEEP,
-        )
+        _LOG.warning("Compiling this scene took %.1f s.", seconds)
+        advise_about_compilation()
     for each in functions:
         code = getattr(each, "__code__", None)
         if code is None:
