@@ -184,6 +184,7 @@ _LATER = {
     "sweeps": ("sweep",),
 }
 _FOLDERS = {name: folder for folder, names in _LATER.items() for name in names}
+__all__ = [*_FOLDERS]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> _Any:

@@ -123,6 +123,9 @@ def test_names_that_load_later_are_those_that_type_checkers_see() -> None:
     assert seen == later | folders
     for _, name in seen:
         assert getattr(jaxmodsim, name) is not None
+    names: dict[str, object] = {}
+    exec("from jaxmodsim import *", names)
+    assert {name for _, name in later} <= {*names}
 
 
 def loaded_by(code: str) -> set[str]:

@@ -25,8 +25,8 @@ def check_scene(scene: Scene, y: State) -> None:
     t, named = y.q[0], len(scene.coordinates)
     if named not in (0, y.q.shape[0]):
         raise ValueError(
-            f"The scene names {named} coordinates ({', '.join(scene.coordinates)}), but q has {y.q.shape[0]}: give a"
-            " name for each, or none."
+            f"The scene has {named} names of coordinates ({', '.join(scene.coordinates)}), but q has the length"
+            f" {y.q.shape[0]}: pass a q0 of {named} numbers, or a name for each number."
         )
     moving = signals_at(scene.params, t, linear=False)
     scene = scene.bind_time(t)

@@ -2,7 +2,8 @@
 
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import prod
 from os import PathLike
@@ -42,36 +43,38 @@ class SweepProgress:
     """The progress of a sweep.
 
     - `done`, `total`: numbers of runs; runs that were already stored count as done.
-    - `failed`: number of runs, of those done, that ended early.
+    - `failed`: number of runs, of those done, that ended early. `reason`: what most of them ended with.
     """
 
     done: int
     total: int
     failed: int
+    reason: str = ""
 
 
 Progress: TypeAlias = Callable[[SweepProgress], None]
 
 
 class SweepProgressText:
-    """Converts reports of progress to text, with the pace since the first report and the time left at that pace."""
+    """Converts reports of progress to text, with the pace since the first chunk and the time left at that pace."""
 
-    def __init__(self) -> None:
-        self._stored: int | None = None
-        self._began = 0.0
+    _stored: int | None = None
+    _first: tuple[int, float] | None = None
 
     def __call__(self, now: SweepProgress) -> str:
         """The text."""
-        if self._stored is None:  # runs that were already stored do not count for the pace
-            self._stored, self._began = now.done, time.perf_counter()
-        count = f"{now.done:,} of {now.total:,} runs"
-        if now.done > self._stored:
-            pace = (now.done - self._stored) / max(time.perf_counter() - self._began, 1e-3)
-            left = f", {pace:,.0f}/s, {minutes((now.total - now.done) / pace)} left" if now.done < now.total else ""
-            return f"{count}, {now.failed:,} failed{left}"
-        if now.done == now.total:
-            return f"{count} already stored, {now.failed:,} failed"
-        return f"{count} already stored, compiling" if now.done else "compiling"
+        self._stored = now.done if self._stored is None else self._stored
+        count, ended = f"{now.done:,} of {now.total:,} runs", now.done == now.total
+        words = f"{count}{' already stored' if now.done == self._stored else ''}, {now.failed:,} failed"
+        if ended:
+            return f"{words}, most with: {now.reason}" if now.reason else words
+        if now.done == self._stored:
+            return f"{count} already stored, compiling" if now.done else "compiling"
+        if self._first is None:  # the time of the first chunk is that of compilation, too
+            self._first = now.done, time.perf_counter()
+            return words
+        pace = (now.done - self._first[0]) / max(time.perf_counter() - self._first[1], 1e-3)
+        return f"{words}, {pace:,.{0 if pace >= 10 else 1}f}/s, {minutes((now.total - now.done) / pace)} left"
 
 
 @dataclass(frozen=True)
@@ -256,15 +259,19 @@ def _run(
     report: Progress | None,
 ) -> None:
     """Compute the blocks that are not stored yet."""
-    missing, done, failed = [], 0, 0
-    for block in range(len(cut)):
-        codes = results.done(block)
-        if codes is None:
-            missing.append(block)
-        else:
-            done, failed = done + codes.size, failed + int((codes != 0).sum())
-    if report is not None:
-        report(SweepProgress(done, request.grid.size, failed))
+    ended: Counter[int] = Counter()  # numbers of runs by their codes
+
+    def tell(codes: Iterable[np.ndarray]) -> None:
+        for each in codes:
+            ended.update(each.ravel().tolist())
+        if report is not None:
+            failed = Counter({code: runs for code, runs in ended.items() if code})
+            reason = request.shapes.messages[failed.most_common(1)[0][0]] if failed else ""
+            report(SweepProgress(ended.total(), request.grid.size, failed.total(), reason))
+
+    stored = {block: results.done(block) for block in range(len(cut))}
+    missing = [block for block, codes in stored.items() if codes is None]
+    tell(codes for codes in stored.values() if codes is not None)
     if not missing:
         return
     work, prediction = predict_steps(work, request.grid, prod(cut.extent))
@@ -278,6 +285,4 @@ def _run(
     computed = in_threads(work, tasks(), devices) if executor is None else run_on_executor(work, tasks(), executor)
     for block, part in computed:
         results.write(block, part)
-        done, failed = done + part.code.size, failed + int((part.code != 0).sum())
-        if report is not None:
-            report(SweepProgress(done, request.grid.size, failed))
+        tell([part.code])

@@ -95,10 +95,11 @@ def test_a_short_computation_writes_only_its_last_text_to_a_file(capsys: pytest.
 def test_words() -> None:
     words = SweepProgressText()
     assert words(SweepProgress(0, 20_000, 0)) == "compiling"
-    assert re.fullmatch(
-        rf"5,000 of 20,000 runs, 1,002 failed, [\d,]+/s, {TIME} left", words(SweepProgress(5000, 20_000, 1002))
-    )
-    assert words(SweepProgress(20_000, 20_000, 1002)) == "20,000 of 20,000 runs, 1,002 failed"
+    # The time of the first chunk, which compiles, says nothing about the others.
+    assert words(SweepProgress(5000, 20_000, 2)) == "5,000 of 20,000 runs, 2 failed"
+    going = words(SweepProgress(5010, 20_000, 3))
+    assert re.fullmatch(rf"5,010 of 20,000 runs, 3 failed, [\d,]+/s, {TIME} left", going)
+    assert words(SweepProgress(20_000, 20_000, 3, "Why.")) == "20,000 of 20,000 runs, 3 failed, most with: Why."
     assert SweepProgressText()(SweepProgress(10, 40, 0)) == "10 of 40 runs already stored, compiling"
     assert SweepProgressText()(SweepProgress(40, 40, 3)) == "40 of 40 runs already stored, 3 failed"
     assert candidate_words("LuGre", 1, 3, 0.00123456) == "LuGre, fold 2 held out, iteration 3: RMSE 0.001235"
@@ -117,7 +118,7 @@ def test_a_sweep_shows_how_it_goes() -> None:
         jms.sweep(lambda a: jnp.sqrt(a), {"a": np.linspace(-1.0, 8.0, 10)}, chunk=4, progress=True)
     lines = terminal.lines()
     assert re.fullmatch(rf"sweep {TIME}: compiling", lines[0])
-    assert re.fullmatch(rf"sweep {TIME}: 10 of 10 runs, 1 failed", lines[-1])
+    assert re.fullmatch(rf"sweep {TIME}: 10 of 10 runs, 1 failed, most with: The function gave NaN\.", lines[-1])
     assert any(re.match(rf"sweep {TIME}: \d of 10 runs, ", line) for line in lines)
 
 

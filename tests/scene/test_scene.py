@@ -214,7 +214,7 @@ REFUSALS: dict[str, tuple[Callable[[], Any], str]] = {
     "friction on two coordinates": (lambda: run(one_friction(), 2), "2 coordinates: say along which displacement"),
     "names of two coordinates for one": (
         lambda: run(Scene(free, coordinates=("x [m]", "y [m]"))),
-        r"The scene names 2 coordinates \(x \[m\], y \[m\]\), but q has 1: give a name for each, or none",
+        r"The scene has 2 names of coordinates \(x \[m\], y \[m\]\), but q has the length 1: pass a q0 of 2 numbers",
     ),
     "vector displacement": (lambda: run(one_friction(along=lambda q: q)), r"along\(q\) returned the shape \(1,\)"),
     "vector belt": (
