@@ -35,6 +35,9 @@ class ProbeTangent(NamedTuple):
 
     tangent: tuple[PyTree, PyTree]
     largest: PyTree
+    # 0 in a first step with a projection, and in one after an event, else 1. That projection changes the tangent by a
+    # jump, which is no error and does not shrink with the step.
+    counts: Array
 
 
 class Probed(NamedTuple):
@@ -79,7 +82,8 @@ def start(
         moved = lambda x: eqx.filter(project(t0, eqx.combine(x, rest)), eqx.is_inexact_array)  # noqa: E731
         tangent = jax.jvp(moved, (numbers,), (tangent,))[1]
     tangent = _moving(tangent), _filled(None, solver_state)
-    return Probed(y0, ProbeTangent(tangent, jtu.tree_map(jnp.abs, _integrated(tangent[0]))))
+    counts = jnp.asarray(1.0 if project is None else 0.0, t0.dtype)
+    return Probed(y0, ProbeTangent(tangent, jtu.tree_map(jnp.abs, _integrated(tangent[0])), counts))
 
 
 class ProbedStep(NamedTuple):
@@ -88,6 +92,7 @@ class ProbedStep(NamedTuple):
     step: PyTree
     change: PyTree
     controller: PyTree
+    projects: bool
 
     def __call__(self, t0: Array, t1: Array, y: Probed, state: PyTree, jump: Real) -> tuple[Any, ...]:
         """The step; its error estimate is a pair: that of the state, and the size of that of the probe."""
@@ -107,8 +112,12 @@ class ProbedStep(NamedTuple):
         )
         largest = jtu.tree_map(lambda d, x: jnp.maximum(jnp.abs(d), x), _integrated(tangent[0]), probe.largest)
         ends = jtu.tree_map(lambda a, b: jnp.maximum(jnp.abs(a), jnp.abs(b)), _integrated(held), _integrated(y1))
-        errors = self._size(error, error_of_probe, largest, ends)
-        return Probed(y1, ProbeTangent(tangent, largest)), (error, errors), dense, state1, result
+        errors = jnp.where(probe.counts > 0, self._size(error, error_of_probe, largest, ends), 0.0)
+        counts = jnp.ones_like(probe.counts)
+        if self.projects and isinstance(y1, EventState):
+            counts = jnp.where(lax.stop_gradient(y1.t) == held.t, counts, 0.0)
+        after = ProbeTangent(tangent, largest, counts)
+        return Probed(y1, after), (error, errors), dense, state1, result
 
     def _size(self, error: PyTree, error_of_probe: PyTree, largest: PyTree, y: PyTree) -> Array:
         """Size of the probe's error in parts of its tolerance."""

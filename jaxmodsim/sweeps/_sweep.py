@@ -70,10 +70,10 @@ class SweepProgressText:
             return f"{words}, most with: {now.reason}" if now.reason else words
         if now.done == self._stored:
             return f"{count} already stored, compiling" if now.done else "compiling"
-        if self._first is None:  # the time of the first chunk is that of compilation, too
-            self._first = now.done, time.perf_counter()
+        runs, began = self._first = self._first or (now.done, time.perf_counter())
+        if now.done == runs:  # the time of the first chunk is that of compilation, too
             return words
-        pace = (now.done - self._first[0]) / max(time.perf_counter() - self._first[1], 1e-3)
+        pace = (now.done - runs) / max(time.perf_counter() - began, 1e-3)
         return f"{words}, {pace:,.{0 if pace >= 10 else 1}f}/s, {minutes((now.total - now.done) / pace)} left"
 
 

@@ -41,7 +41,7 @@ def test_a_scene_and_its_gradient_print_names_values_and_units() -> None:
     np.testing.assert_allclose(float(line.split()[-1]), gradient.effects[0].law.Fc, rtol=1e-5)
     mass = eqx.filter(SCENE, lambda x: x is SCENE.params["m"])
     by_mass = eqx.filter_grad(lambda part: end(eqx.combine(part, SCENE)))(mass)
-    assert [row[0] for row in rows(by_mass)] == ["number", "m"]
+    assert [row[0] for row in rows(by_mass)] == ["number [unit]", "m"]
     many = jms.Scene(lambda t, q, qd, p: 0.5 * qd[0] ** 2, params={f"p{i}": i for i in range(40)})
     assert len(str(many).splitlines()) <= 30
     assert "... and 18 more" in str(many)
