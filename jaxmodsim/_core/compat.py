@@ -9,7 +9,7 @@ available groups. Code that needs a missing group uses public interfaces instead
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from types import TracebackType
@@ -76,7 +76,7 @@ with _probe("kernels", "single runs and their derivatives take several times as 
     from jaxlib.mlir.dialects import stablehlo as stablehlo
 
     # XLA ends the process if it cannot compile a marked call, so only tested versions pass.
-    if jaxlib.version.__version_info__[:2] != (0, 10):
+    if not (0, 10) <= jaxlib.version.__version_info__[:2] <= (0, 12):
         raise ImportError(f"not tested with jaxlib {jaxlib.version.__version__}")
 
 with _probe(
@@ -119,6 +119,14 @@ if _LOSSES:
         ", ".join(map(" ".join, versions("jax", "equinox", "diffrax").items())),
         ". ".join(_LOSSES),
     )
+
+
+def scan_counts(params: Mapping[str, Any]) -> tuple[int, int]:
+    """Numbers of constants and of carried values of a `scan`, from the parameters of its equation."""
+    if "ft_in" in params:  # from JAX 0.11
+        consts, carry, _ = params["ft_in"].unpack()
+        return len(consts), len(carry)
+    return params["num_consts"], params["num_carry"]
 
 
 def programs_of(function: Any) -> int:

@@ -14,7 +14,7 @@ from jax.lax import GatherScatterMode
 from jaxtyping import ArrayLike, PyTree
 
 from .arrays import is_known
-from .compat import AVAILABLE, ClosedJaxpr, Jaxpr, JaxprEqn, Literal
+from .compat import AVAILABLE, ClosedJaxpr, Jaxpr, JaxprEqn, Literal, scan_counts
 from .user_errors import explain
 
 _LOG = logging.getLogger("jaxmodsim")
@@ -174,7 +174,7 @@ def _bodies(eqn: JaxprEqn, operands: list[_Known]) -> list[tuple[ClosedJaxpr | J
     if kind in _CALLS:
         same = len(operands)
     elif kind == "scan":
-        same = eqn.params["num_consts"]
+        same, _ = scan_counts(eqn.params)
     elif kind == "cond":
         which, *operands = operands
         same = len(operands)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._core.compat import AVAILABLE, ClosedJaxpr, JaxprEqn
+from .._core.compat import AVAILABLE, ClosedJaxpr, JaxprEqn, scan_counts
 from .._core.lu import is_constant
 from .._core.scalarise import AbstractScalars, AbstractSymbol, Params, Parts, Value, is_apart
 
@@ -91,7 +91,7 @@ def program_of(closed: ClosedJaxpr, arguments: Sequence[Symbol]) -> Program:
     if "jaxprs" not in AVAILABLE:
         raise RuntimeError(
             f"to_c reads traced functions by jax.extend.core, which is different in jax {jax.__version__}."
-            " Install jax>=0.10,<0.11."
+            " Install jax>=0.10,<0.13."
         )
     writer = _StatementWriter()
     inputs: list[Value] = [_scalar_array(x) for x in arguments]
@@ -339,8 +339,8 @@ class _StatementWriter(AbstractScalars):
 
     def scan(self, params: Params, inputs: list[Value]) -> list[Value]:
         """A loop with a known number of iterations, written out if it reads or writes rows of arrays."""
-        body, length, n_carry = params["jaxpr"], params["length"], params["num_carry"]
-        consts, inputs = inputs[: params["num_consts"]], inputs[params["num_consts"] :]
+        (n_consts, n_carry), body, length = scan_counts(params), params["jaxpr"], params["length"]
+        consts, inputs = inputs[:n_consts], inputs[n_consts:]
         starts, rows = [self.parts(x) for x in inputs[:n_carry]], [self.parts(x) for x in inputs[n_carry:]]
         if rows or len(body.jaxpr.outvars) > n_carry or length == 1:
             outputs: list[list[Value]] = []
