@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxmodsim._core.system import describe_machine
-from jaxmodsim._core.timing import measure
+from jaxmodsim.analysis._timing import measure
 
 # Paths that benches write, whose changes do not make a commit unclean.
 WRITTEN = ("bench/results", "README.md", "docs")

@@ -1,9 +1,9 @@
-"""Ensembles on the device that JAX finds: many runs of the Lorenz system, and of the LuGre test bench, at once.
+"""Ensembles on one device: many runs at once of the Lorenz system, the LuGre test bench and a belt with stick-slip.
 
 The Lorenz system is that of C. Utkarsh et al., "Automated translation and accelerated solving of differential equations
 on multiple GPU platforms", Computer Methods in Applied Mechanics and Engineering 419:116591, 2024: from (1, 0, 0) over
 one second with sigma = 10, beta = 8/3 and rho from 0 to 21, by Tsit5 of diffrax. Single precision has coarser
-tolerances. On a GPU: `pip install "jax[cuda13]"`, then `python -m bench ensemble`.
+tolerances. `ensemble_gpu` does the same on a GPU.
 """
 
 from collections.abc import Callable
@@ -17,44 +17,66 @@ import numpy as np
 from jaxtyping import Array
 from scipy.integrate import solve_ivp
 
+import jaxmodsim as jms
 from bench.record import Result, timed
-from bench.tasks import TESTBENCH
+from bench.tasks import TESTBENCH, Belt
 
-LORENZ, BOX = "Lorenz system", "LuGre test bench"
+LORENZ, BOX, BELT = "Lorenz system", "LuGre test bench", "Coulomb belt"
 RHO = 21.0
+# The first 12 events of the belt.
+STICK_SLIP = Belt(t1=6.0)
 # Relative tolerances, by case and precision.
-RTOL = {LORENZ: {"float64": 1e-8, "float32": 1e-6}, BOX: {"float64": 1e-4, "float32": 1e-4}}
+RTOL = {
+    LORENZ: {"float64": 1e-8, "float32": 1e-6},
+    BOX: {"float64": 1e-4, "float32": 1e-4},
+    BELT: {"float64": 1e-6, "float32": 1e-5},
+}
 # Number of runs in a call on a CPU and on a GPU, and number of runs with error measures.
-RUNS = {"cpu": 2**13, "gpu": 2**23}
+RUNS = {"cpu": dict.fromkeys(RTOL, 2**13), "gpu": {LORENZ: 2**23, BOX: 2**23, BELT: 2**20}}
 JUDGED = 16
 
 
 def main(smoke: bool, out: Path) -> Result:
-    """Measure the time of all runs in one call, in both precisions, and their errors."""
+    """Measure on the processor, whether or not there is a GPU."""
     del out
-    device = jax.devices()[0]
-    count = 64 if smoke else RUNS.get(device.platform, RUNS["gpu"])
-    name = "the processor" if device.platform == "cpu" else device.device_kind
-    result = Result("ensemble", ("diffrax",), {"device": name, "runs": count})
-    makers = {LORENZ: (_lorenz, np.linspace(0.0, RHO, count)), BOX: (_box, TESTBENCH.sets(count))}
-    exact = {LORENZ: np.array([_lorenz_end(rho) for rho in makers[LORENZ][1][:: count // JUDGED]])}
-    exact[BOX] = TESTBENCH.exact_ends(makers[BOX][1][:: count // JUDGED])
+    return measure_on(jax.devices("cpu")[0], "ensemble", smoke)
+
+
+def measure_on(device: jax.Device, name: str, smoke: bool) -> Result:
+    """Measure the time of all runs of a case in one call, in both precisions, and their errors."""
+    counts = dict.fromkeys(RTOL, 64) if smoke else RUNS[device.platform]
+    title = "the processor" if device.platform == "cpu" else device.device_kind
+    result = Result(name, ("diffrax",), {"device": title})
+    sets = {
+        LORENZ: np.linspace(0.0, RHO, counts[LORENZ]),
+        BOX: TESTBENCH.sets(counts[BOX]),
+        BELT: STICK_SLIP.sets(counts[BELT]),
+    }
+    judged = {case: each[:: counts[case] // JUDGED] for case, each in sets.items()}
+    exact = {
+        LORENZ: np.array([_lorenz_end(rho) for rho in judged[LORENZ]]),
+        BOX: TESTBENCH.exact_ends(judged[BOX]),
+        BELT: STICK_SLIP.exact_ends(judged[BELT]),
+    }
     calls: dict[tuple[str, str], Callable[[], Array]] = {}
-    for case, (run, sets) in makers.items():
-        for kind, rtol in RTOL[case].items():
-            many = jax.vmap(partial(run, rtol=rtol))
-            if device.platform == "cpu":
-                many = partial(jax.lax.map, partial(run, rtol=rtol), batch_size=64)
-            numbers = jax.device_put(jnp.asarray(sets, kind))
-            calls[case, kind] = partial(_ready, jax.jit(many), numbers)
-    for (case, kind), found in timed(calls, 2 if smoke else 7, limit_s=60.0).items():
-        about = {"case": case, "at": kind}
-        result.add_time("time of all", found, **about)
-        if "failed" in found:
-            continue
-        result.add("runs a second", count / found["median_s"], "1/s", **about)
-        ends = np.asarray(calls[case, kind](), float)[:: count // JUDGED]
-        result.add("error", float(np.max(np.abs(ends - exact[case]) / np.maximum(np.abs(exact[case]), 1.0))), **about)
+    with jax.default_device(device):
+        for case, run in {LORENZ: _lorenz, BOX: _box, BELT: _belt}.items():
+            for kind, rtol in RTOL[case].items():
+                many = jax.vmap(partial(run, rtol=rtol))
+                if device.platform == "cpu":
+                    many = partial(jax.lax.map, partial(run, rtol=rtol), batch_size=64)
+                numbers = jax.device_put(jnp.asarray(sets[case], kind), device)
+                calls[case, kind] = partial(_ready, jax.jit(many), numbers)
+        for (case, kind), found in timed(calls, 2 if smoke else 7, limit_s=60.0).items():
+            about = {"case": case, "at": kind}
+            result.add("runs", counts[case], **about)
+            result.add_time("time of all", found, **about)
+            if "failed" in found:
+                continue
+            result.add("runs a second", counts[case] / found["median_s"], "1/s", **about)
+            ends = np.asarray(calls[case, kind](), float)[:: counts[case] // JUDGED]
+            error = np.max(np.abs(ends - exact[case]) / np.maximum(np.abs(exact[case]), 1.0))
+            result.add("error", float(error), **about)
     return result
 
 
@@ -90,3 +112,10 @@ def _lorenz_end(rho: float) -> float:
 def _box(numbers: Array, rtol: float) -> Array:
     """The final velocity [m/s]."""
     return TESTBENCH.simulate(numbers, jnp.asarray(rtol, numbers.dtype), throw=False).qd[-1, 0]
+
+
+def _belt(numbers: Array, rtol: float) -> Array:
+    """The final position [m]."""
+    start = jnp.zeros(1, numbers.dtype), numbers[4:]
+    scene = STICK_SLIP.scene(numbers)
+    return jms.simulate(scene, *start, STICK_SLIP.t1, rtol=rtol, atol=STICK_SLIP.atol * rtol, throw=False).q[-1, 0]

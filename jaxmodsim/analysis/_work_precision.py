@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from .._core.system import describe_machine
-from .._core.timing import measure
 from ..friction import AbstractSetValuedLaw, DeadZone, LuGre, Regularized
 from ..scene import Friction, Scene, elements
 from ..simulation import Trajectory, default_solver, evaluations_per_step
@@ -31,6 +30,7 @@ from ._reference import (
     scale_of,
 )
 from ._sensitivity import chosen_numbers, observable_of, observed
+from ._timing import measure
 from ._work_rows import Row, Timing, WorkPrecision
 
 # Prefixes of the names of initial values, which are no numbers of the scene.

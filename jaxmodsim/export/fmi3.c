@@ -223,14 +223,20 @@ fmi3Status fmi3SetFloat64(fmi3Instance instance, REFERENCES, const fmi3Float64 v
   return fmi3OK;
 }
 
+/* Numbers that changed between events are checked when they are used. */
+static bool usable(Instance *c) {
+  if (!c->motion.s.changed || motion_admits(&c->motion)) return true;
+  return fail(c, c->motion.failure), false;
+}
+
 /* The state with which the motion goes on: modes are decided when the initialization or a change between steps ends. */
 static bool present(Instance *c, State *s) {
   Motion m = c->motion;
   *s = m.s;
   if (s->phase == INITIALIZATION || (s->phase == STEP_MODE && s->changed)) {
     if (!motion_start(&m)) return fail(c, m.failure), false;
-  } else if (s->changed && !motion_admits(&m)) {
-    return fail(c, m.failure), false;
+  } else if (!usable(c)) {
+    return false;
   } else if (s->phase == STEP_MODE && !s->pending && motion_due(&m, 0.0) && !motion_fire(&m)) {
     return true;
   }
@@ -439,7 +445,7 @@ fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance instance, fmi3Float64 
   SELF;
   STATE;
   if (n != STATES) return fail(c, "the number of continuous states is another one");
-  if (s->changed && !motion_admits(&c->motion)) return fail(c, c->motion.failure);
+  if (!usable(c)) return fmi3Error;
   model_rate(s->t, s->numbers, s->y, s->mode, derivatives);
   for (int i = 0; i < STATES; ++i) {
     if (!isfinite(derivatives[i])) return fmi3Discard; /* the importer may try a shorter step */
@@ -452,7 +458,7 @@ fmi3Status fmi3GetEventIndicators(fmi3Instance instance, fmi3Float64 indicators[
   if (n != MODES) return fail(c, "the number of event indicators is another one");
 #if MODES
   STATE;
-  if (s->changed && !motion_admits(&c->motion)) return fail(c, c->motion.failure);
+  if (!usable(c)) return fmi3Error;
   model_guards(s->t, s->numbers, s->y, s->mode, c->motion.tolerances, c->motion.guards[0]);
   memcpy(indicators, c->motion.guards[0], MODES * sizeof(double));
 #endif

@@ -22,7 +22,7 @@ from .._core.speed import recommend_tuning, warn_about_compilation, warn_about_f
 from .._core.user_errors import LastLines
 from ..scene import Scene, State, vector_field
 from ..solvers import Gauss, ImplicitFriction, Rodas5P
-from ._outcome import SUCCESS, SimulationError, describe_failure, describe_start, outcome_messages, violation_code
+from ._outcome import SUCCESS, SimulationError, describe_start, outcome_messages, violation_code
 from ._run_request import MOST_EVENTS, MOST_STEPS, RunRequest, run_request
 from ._solve import RunOutput, compiled_runs, default_solver, solve
 from ._trajectory import Trajectory, trajectory
@@ -219,11 +219,8 @@ def _check_initial_state(request: RunRequest) -> None:
 def _raise_early_end(request: RunRequest, solved: RunOutput) -> RunOutput:
     """Raise an error for a run that ended early: at once for known values, by a run-time check for traced ones."""
     if is_known(solved.code):
-        code = int(solved.code)
-        if code != SUCCESS:
-            t, y = solved.end or (solved.t[-1], jtu.tree_map(lambda x: x[-1], solved.y))
-            scene, t, y = lax.stop_gradient((request.scene, t, y))
-            raise SimulationError(describe_failure(scene, float(t), y, code))
+        if failure := solved.failure(request.scene):
+            raise SimulationError(failure)
         return solved
     messages = LastLines(outcome_messages(request.scene, request.q0.shape[0]))
     return eqx.branched_error_if(solved, solved.code != SUCCESS, solved.code, messages)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._core.compat import programs_of
@@ -32,7 +33,7 @@ from ..solvers import (
     without_error_checks,
 )
 from ._integrated_system import AugmentedState, Instant, IntegratedSystem, RunFunctions, Work, project
-from ._outcome import ILL_POSED, MISSED_EVENT, SUCCESS, Ending, end_code, start_code
+from ._outcome import ILL_POSED, MISSED_EVENT, SUCCESS, Ending, describe_failure, end_code, start_code
 from ._run_request import RunRequest
 
 # Speed of rest, as a part of the absolute tolerance.
@@ -75,6 +76,14 @@ class RunOutput(NamedTuple):
     log: EventLog | None
     work: Work | None
     nodes: Nodes | None
+
+    def failure(self, scene: Scene) -> str:
+        """The sentence of an early end with known values; empty if the run reached t1."""
+        if int(self.code) == SUCCESS:
+            return ""
+        t, y = self.end or (self.t[-1], jtu.tree_map(lambda x: x[-1], self.y))
+        scene, t, y = jax.lax.stop_gradient((scene, t, y))
+        return describe_failure(scene, float(t), y, int(self.code))
 
 
 def default_solver(scene: Scene, dof: int, fixed_step: bool) -> dfx.AbstractSolver:
@@ -143,10 +152,16 @@ def _step_from(t: Array, scene: Scene) -> Scene:
     return scene.step_from(t)
 
 
+def _error_norm(scaled: PyTree) -> Array:
+    """Root mean square; infinite where an infinite state makes the ratio to it undefined."""
+    size = optx.rms_norm(scaled)
+    return jnp.where(jnp.isnan(size), jnp.inf, size)
+
+
 def _controller(request: RunRequest, solver: dfx.AbstractSolver) -> dfx.AbstractStepSizeController:
     p, i = _ROSENBROCK_GAINS if isinstance(solver, Rodas5P) and not request.scene.mode_names else _GAINS
     steps = {"dtmin": request.shortest_step, "dtmax": request.dtmax, "force_dtmin": False}
-    adaptive = dfx.PIDController(*_tolerances(request), pcoeff=p, icoeff=i, **steps)
+    adaptive = dfx.PIDController(*_tolerances(request), pcoeff=p, icoeff=i, norm=_error_norm, **steps)
     controller = adaptive if request.dt is None else FiniteSteps()
     times = sample_times(request.scene.params, linear=True)
     if request.scene.mode_names:

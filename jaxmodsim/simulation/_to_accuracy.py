@@ -20,9 +20,9 @@ from .._core.trace_checks import check_indices
 from ..scene import Scene
 from ._accuracy import Accuracy, Attempt, CostScaling, evaluations_per_step
 from ._observe import named_series
-from ._outcome import SUCCESS, SimulationError, describe_failure
+from ._outcome import SimulationError
 from ._run_request import MOST_EVENTS, MOST_STEPS, Plugin, RunRequest, run_request
-from ._solve import RunOutput, default_solver, solve
+from ._solve import default_solver, solve
 from ._trajectory import Trajectory, trajectory
 
 _ACCURACIES = (1e-12, 1e-1)
@@ -135,7 +135,7 @@ class _AccuracySearch:
             request = request._replace(dtmax=np.asarray((request.t1 - request.t0) / _PART, dtype))
         solved = solve(request)
         _check_known(solved)
-        run, failure = trajectory(request, solved), _failure(request, solved)
+        run, failure = trajectory(request, solved), solved.failure(request.scene)
         observed = np.zeros(0) if failure else _observed(self.observe, run)
         return _TrialRun(run, which, solver, rtol, atol, observed, _states(run), failure)
 
@@ -276,7 +276,10 @@ def _search(search: _AccuracySearch, choices: tuple[int, ...], own: bool, throw:
     rtol = _round(max(_AHEAD * asked, search.tightest))
     first = search.pair(rtol)
     if len(first) < 2:
-        return _early(search, rtol, throw)
+        if throw:
+            failure = search.failure(rtol, 0) or search.failure(rtol, search.second)
+            raise SimulationError(f"accuracy={asked:g} needs runs at rtol {rtol:g} for comparison. {failure}")
+        return search.run(rtol, 0).run
     references = _references(search, rtol, own)
     if references.remark:
         if throw:
@@ -425,22 +428,6 @@ def _remark(search: _AccuracySearch, nearest: _References, rtol: float) -> str:
         " jumps at a saved time (a force or a mode at an event). Ask for a shorter run, or for an observable that does"
         " not depend on the phase."
     )
-
-
-def _early(search: _AccuracySearch, rtol: float, throw: bool) -> Trajectory:
-    """Result if runs end early: an error with the sentence of the first, or that run."""
-    if throw:
-        failure = search.failure(rtol, 0) or search.failure(rtol, search.second)
-        raise SimulationError(f"accuracy={search.asked:g} needs runs at rtol {rtol:g} for comparison. {failure}")
-    return search.run(rtol, 0).run
-
-
-def _failure(request: RunRequest, solved: RunOutput) -> str:
-    """Sentence of an early end; empty if the run reached t1."""
-    if int(solved.code) == SUCCESS:
-        return ""
-    t, y = solved.end or (solved.t[-1], jtu.tree_map(lambda x: x[-1], solved.y))
-    return describe_failure(request.scene, float(t), y, int(solved.code))
 
 
 def _chosen(search: _AccuracySearch, references: _References, best: _TrialRun, estimate: float) -> Trajectory:

@@ -152,7 +152,7 @@ class ProbedController(NamedTuple):
             if not _is_pid(x):
                 return x
             norm: Callable[[PyTree], Array] = x.norm
-            return eqx.tree_at(lambda x: x.norm, x, lambda scaled: jnp.maximum(norm(scaled), of_probe))
+            return eqx.tree_at(lambda x: x.norm, x, lambda scaled: norm(jnp.maximum(norm(scaled), of_probe)))
 
         controller = jtu.tree_map(with_probe, self.controller, is_leaf=_is_pid)
         return controller.adapt_step_size(t0, t1, y0.y, y1.y, args, of_state, order, state)

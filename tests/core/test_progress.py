@@ -99,7 +99,7 @@ def test_words() -> None:
     assert words(SweepProgress(5000, 20_000, 2)) == "5,000 of 20,000 runs, 2 failed"
     going = words(SweepProgress(5010, 20_000, 3))
     assert re.fullmatch(rf"5,010 of 20,000 runs, 3 failed, [\d,]+/s, {TIME} left", going)
-    assert words(SweepProgress(20_000, 20_000, 3, "Why.")) == "20,000 of 20,000 runs, 3 failed, most with: Why."
+    assert words(SweepProgress(20_000, 20_000, 1002, "Why.")) == "20,000 of 20,000 runs, 1,002 failed, most with: Why."
     assert SweepProgressText()(SweepProgress(10, 40, 0)) == "10 of 40 runs already stored, compiling"
     assert SweepProgressText()(SweepProgress(40, 40, 3)) == "40 of 40 runs already stored, 3 failed"
     assert candidate_words("LuGre", 1, 3, 0.00123456) == "LuGre, fold 2 held out, iteration 3: RMSE 0.001235"

@@ -1,6 +1,7 @@
 """Modes of an FMU before its first step, after changes between steps, and after a jump of a load."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,10 +13,22 @@ from ..helpers.compilers import OWN, needs_fmpy
 fmpy = pytest.importorskip("fmpy", reason="needs FMPy, which runs FMUs")
 
 
+def opened(kind: str, path: Path) -> tuple[Any, dict[str, int], list[bytes]]:
+    """An instance of an FMU, of a class of `fmpy.fmi3`; the references of its variables; and what it will log."""
+    from fmpy import fmi3
+
+    description = fmpy.read_model_description(str(path))
+    folder = fmpy.extract(str(path), str(path.with_suffix("")))
+    one = getattr(fmi3, kind)(
+        guid=description.guid, unzipDirectory=folder, modelIdentifier=path.stem, instanceName="one"
+    )
+    said: list[bytes] = []
+    one.instantiate(logMessage=lambda _environment, _status, _category, message: said.append(message))
+    return one, {each.name: each.valueReference for each in description.modelVariables}, said
+
+
 @needs_fmpy
 def test_modes_are_decided_before_the_first_step_and_after_a_jump_of_a_load(tmp_path: Path) -> None:
-    from fmpy.fmi3 import FMU3Slave
-
     scene = jms.Scene(
         lambda t, q, qd, p: 0.5 * p["m"] * qd[0] ** 2,
         {"m": 1.0, "pull": 0.0},
@@ -27,12 +40,7 @@ def test_modes_are_decided_before_the_first_step_and_after_a_jump_of_a_load(tmp_
     path = jms.export.fmu(
         scene, [0.0], [0.3], tmp_path / "cart.fmu", inputs=["pull", "friction.belt_velocity"], platforms=[OWN]
     )
-    description = fmpy.read_model_description(str(path))
-    place = {each.name: each.valueReference for each in description.modelVariables}
-    one = FMU3Slave(
-        guid=description.guid, unzipDirectory=fmpy.extract(str(path), str(tmp_path / "cart")),
-        modelIdentifier="cart", instanceName="one",
-    )  # fmt: skip
+    one, place, said = opened("FMU3Slave", path)
 
     def check(force: float, rate: float) -> None:
         assert one.getFloat64([place["friction"], place["der(qd[0])"]]) == pytest.approx([force, rate])
@@ -40,8 +48,6 @@ def test_modes_are_decided_before_the_first_step_and_after_a_jump_of_a_load(tmp_
         by = [place["der(qd[0])"]], [place["friction.Fc"]]
         assert one.getDirectionalDerivative(*by, [1.0]) == one.getAdjointDerivative(*by, [1.0]) == [-np.sign(force)]
 
-    said: list[bytes] = []
-    one.instantiate(logMessage=lambda _environment, _status, _category, message: said.append(message))
     # Numbers out of range are refused when they are used: two that limit each other change one after the other.
     one.enterInitializationMode(tolerance=1e-6, startTime=0.0)
     for name, wrong, right in (("Fc", -1.0, 1.0), ("Fs", 0.5, 1.5)):
@@ -75,19 +81,11 @@ def test_modes_are_decided_before_the_first_step_and_after_a_jump_of_a_load(tmp_
 
 @needs_fmpy
 def test_an_input_out_of_range_between_events_of_model_exchange_is_refused(tmp_path: Path) -> None:
-
-    from fmpy.fmi3 import FMU3Model, fmi3Float64
+    from fmpy.fmi3 import fmi3Float64
 
     scene = jms.Scene(lambda t, q, qd, p: 0.5 * qd[0] ** 2, effects=(jms.Friction(jms.Coulomb(1.0, 1.5)),))
     path = jms.export.fmu(scene, [0.0], [0.3], tmp_path / "box.fmu", inputs=["friction.Fs"], platforms=[OWN])
-    description = fmpy.read_model_description(str(path))
-    place = {each.name: each.valueReference for each in description.modelVariables}
-    one = FMU3Model(
-        guid=description.guid, unzipDirectory=fmpy.extract(str(path), str(tmp_path / "box")),
-        modelIdentifier="box", instanceName="one",
-    )  # fmt: skip
-    said: list[bytes] = []
-    one.instantiate(logMessage=lambda _environment, _status, _category, message: said.append(message))
+    one, place, said = opened("FMU3Model", path)
     one.enterInitializationMode(tolerance=1e-6, startTime=0.0)
     one.exitInitializationMode()
     one.updateDiscreteStates()

@@ -14,6 +14,8 @@ import jaxmodsim as jms
 from jaxmodsim import problems
 from jaxmodsim.scene import replace_elements
 
+from ..helpers.differences import central_difference
+
 BOX = problems.ramped_box.scene(problems.ramped_box.lugre())
 TS = jnp.linspace(0.0, 10.0, 11)
 
@@ -133,6 +135,23 @@ def test_a_tolerance_above_the_width_of_a_smoothed_law_is_refused() -> None:
     assert [bool(ok) for ok in runs.result.ok] == [False, True, False]
     assert "atol is above the width" in str(runs.result)
     assert bool(run(1e-7, dt=1e-2).result.ok)
+
+
+@pytest.mark.parametrize("effects", [(), (jms.Friction(jms.Coulomb(0.5), along=lambda q: q[1]),)])
+def test_a_step_that_overflows_is_repeated_with_a_shorter_one(effects: Any) -> None:
+    """A step of a falling body ends deep in a wall of `exp(-k q)`, where its force and its error are infinite."""
+
+    def lagrangian(_t: Any, q: Any, qd: Any, p: Any) -> Any:
+        return 0.5 * jnp.sum(qd**2) - 9.81 * q[0] - jnp.exp(-p["k"] * q[0])
+
+    def end(k: Any, rtol: float = 1e-9) -> tuple[Any, jms.Trajectory]:
+        scene = jms.Scene(lagrangian, {"k": k}, effects)
+        run = jms.simulate(scene, [1.0, 0.0], [0.0, 0.4], 1.0, rtol=rtol, max_steps=1000)
+        return run.q[-1, 0], run
+
+    (height, run), slope = jax.value_and_grad(end, has_aux=True)(1e4)
+    assert float(0.5 * run.qd[-1, 0] ** 2 + 9.81 * height) == pytest.approx(9.81, rel=1e-7)
+    assert float(slope) == pytest.approx(central_difference(lambda k: end(k, 1e-11)[0], 1e4, 100.0), rel=1e-3)
 
 
 def test_energies_of_a_run_that_cannot_be_repeated_with_the_work_beside_it() -> None:

@@ -108,3 +108,19 @@ def test_nothing_is_said_where_numbers_are_traced(caplog: pytest.LogCaptureFixtu
     speed.warn_about_rounding.cache_clear()
     jax.jit(lambda t1: pulled(F, t1, 1e-6).q)(10.0)
     assert "rounding" not in caplog.text
+
+
+def test_a_bristle_that_overflows_in_a_long_step_is_integrated_by_shorter_ones() -> None:
+    """Where the box comes to rest, a step of the length before it takes the bristle beyond the largest number."""
+    case = jms.problems.named_problems()["pulled_box"]()
+    scale, (q0, qd0) = np.linspace(1.0, 1.004, 16), (np.asarray(x, F) for x in (case.q0, case.qd0))
+
+    def end(scale: Any) -> tuple[Any, Any]:
+        scene = jax.tree.map(lambda x: jnp.asarray(x, scale.dtype) * scale, case.scene)
+        kind = scale.dtype
+        run = jms.simulate(scene, q0.astype(kind), qd0.astype(kind), case.t1, rtol=1e-5, throw=False)
+        return run.q[-1], run.code
+
+    ends = {kind: jax.jit(lambda x: jax.lax.map(end, x))(jnp.asarray(scale, kind)) for kind in (F, np.float64)}
+    assert not np.any(ends[F][1])
+    np.testing.assert_allclose(ends[F][0], ends[np.float64][0], rtol=3e-4)
