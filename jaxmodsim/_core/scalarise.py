@@ -28,7 +28,7 @@ _ELEMENTWISE = {
     *("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh"),
     *("exp", "exp2", "expm1", "log", "log1p", "logistic", "sqrt", "rsqrt", "cbrt", "erf", "erfc", "floor", "ceil"),
     *("eq", "ne", "lt", "le", "gt", "ge", "and", "or", "not", "xor", "select_n", "is_finite", "convert_element_type"),
-    *("copy", "stop_gradient", "clamp", "round"),
+    *("copy", "stop_gradient", "clamp", "round", "one_minus_square", "log2"),
 }
 # Expensive functions that XLA treats as cheap, and recomputes wherever their result is used.
 _REPEATED = {"sin", "cos", "tan"}

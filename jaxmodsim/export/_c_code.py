@@ -29,7 +29,7 @@ _FORMS = {
 }
 _LOGICAL = {"and", "or", "xor", "not"}
 _FUNCTIONS = {"sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh"}
-_FUNCTIONS |= {"exp", "exp2", "expm1", "log", "log1p", "sqrt", "cbrt", "floor", "ceil", "pow", "erf", "erfc"}
+_FUNCTIONS |= {"exp", "exp2", "expm1", "log", "log1p", "log2", "sqrt", "cbrt", "floor", "ceil", "pow", "erf", "erfc"}
 _NAMES = {name: name for name in _FUNCTIONS} | {"abs": "fabs", "rem": "fmod", "round": "rint"}
 _TYPES = {"f64": "double", "f32": "float", "i": "int", "b8": "int"}
 

@@ -157,6 +157,9 @@ class _StatementWriter(AbstractScalars):
             return self.power(first, params["y"])
         if name == "square":
             return self.apply(jax.lax.mul, "mul", {}, [first, first])
+        if name == "one_minus_square":  # from JAX 0.11
+            one = _one(first.dtype)
+            return self.assign("mul", [self.assign("sub", [one, first]), self.assign("add", [one, first])])
         if name in ("rsqrt", "logistic"):
             one = _one(first.dtype)
             if name == "rsqrt":

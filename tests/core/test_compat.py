@@ -57,7 +57,7 @@ def test_a_missing_name_turns_off_its_group(monkeypatch: pytest.MonkeyPatch, cap
     monkeypatch.delenv("JAXMODSIM_PROBES_OFF", raising=False)
     monkeypatch.delattr("equinox.internal.create_vprim")
     monkeypatch.delattr("jax.extend.core.get_opaque_trace_state")
-    monkeypatch.setattr("jaxlib.version.__version_info__", (0, 11, 0))
+    monkeypatch.setattr("jaxlib.version.__version_info__", (0, 13, 0))
     caplog.set_level(logging.WARNING, "jaxmodsim")
     again = imported_again()
     assert GROUPS - {"kernels", "stored_steps", "trace_state"} == again.AVAILABLE

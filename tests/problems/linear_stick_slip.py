@@ -180,9 +180,12 @@ class _Mode:
     @cached_property
     def powers(self) -> np.ndarray:
         """Propagators over 1, 2, ... grid steps, shape `[chunk, x, x]`."""
-        import scipy.linalg  # slow to import, and only needed here
-
-        powers = scipy.linalg.expm(self.rate * self.step)[None]
+        # A step is short enough for the series, also in `series`; `scipy.linalg.expm` loses digits from SciPy 1.18 on.
+        term = one = np.eye(len(self.rate))
+        for i in range(1, _TERMS):
+            term = self.rate @ term * (self.step / i)
+            one = one + term
+        powers = one[None]
         while len(powers) < _CHUNK:
             powers = np.concatenate([powers, powers @ powers[-1]])
         return powers

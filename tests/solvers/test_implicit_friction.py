@@ -315,7 +315,8 @@ def test_roots_of_steep_functions(dtype: Any) -> None:
     roots, misfit = jax.jit(jax.vmap(solve))(widths.ravel().astype(dtype), loads.ravel().astype(dtype))
     assert roots.solved.all()
     assert (np.abs(misfit) <= 8e-3 * np.finfo(dtype).eps * loads.ravel().clip(1.0)).all()
-    assert int(np.max(roots.evaluations)) < 100
+    # 76; 111 where XLA rounds each operation, as from jaxlib 0.11: at a load of 1 the function ends in rounding.
+    assert int(np.max(roots.evaluations)) < 120
 
 
 @pytest.mark.parametrize("blocks", [(1, 1, 1), (2, 2)])
