@@ -193,7 +193,7 @@ def test_an_event_within_rounding_of_the_start_fires_once() -> None:
     successful, count, t = run(jnp.asarray(y0, real), jnp.asarray(rate, real))
     assert np.all(successful)
     np.testing.assert_array_equal(count, 1.0)
-    # XLA of jaxlib 0.10 cancels the tens. Later ones round: the guard is a staircase, and an event up to 4 stairs early.
+    # XLA of jaxlib 0.10 cancels the tens. From 0.11 on the guard is a staircase, and an event up to 4 stairs early.
     stair = float(np.spacing(np.float32(10.0)))
     np.testing.assert_allclose(t * rate, y0, atol=10.0 * eps if jaxlib.__version__ < "0.11" else 4.0 * stair)
 
