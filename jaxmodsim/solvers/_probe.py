@@ -35,8 +35,8 @@ class ProbeTangent(NamedTuple):
 
     tangent: tuple[PyTree, PyTree]
     largest: PyTree
-    # 0 in a first step with a projection, and in one after an event, else 1. That projection changes the tangent by a
-    # jump, which is no error and does not shrink with the step.
+    # 0 in a first step with a projection, else 1. That projection changes the tangent by a jump, which is no error and
+    # does not shrink with the step.
     counts: Array
 
 
@@ -92,7 +92,6 @@ class ProbedStep(NamedTuple):
     step: PyTree
     change: PyTree
     controller: PyTree
-    projects: bool
 
     def __call__(self, t0: Array, t1: Array, y: Probed, state: PyTree, jump: Real) -> tuple[Any, ...]:
         """The step; its error estimate is a pair: that of the state, and the size of that of the probe."""
@@ -113,10 +112,7 @@ class ProbedStep(NamedTuple):
         largest = jtu.tree_map(lambda d, x: jnp.maximum(jnp.abs(d), x), _integrated(tangent[0]), probe.largest)
         ends = jtu.tree_map(lambda a, b: jnp.maximum(jnp.abs(a), jnp.abs(b)), _integrated(held), _integrated(y1))
         errors = jnp.where(probe.counts > 0, self._size(error, error_of_probe, largest, ends), 0.0)
-        counts = jnp.ones_like(probe.counts)
-        if self.projects and isinstance(y1, EventState):
-            counts = jnp.where(lax.stop_gradient(y1.t) == held.t, counts, 0.0)
-        after = ProbeTangent(tangent, largest, counts)
+        after = ProbeTangent(tangent, largest, jnp.ones_like(probe.counts))
         return Probed(y1, after), (error, errors), dense, state1, result
 
     def _size(self, error: PyTree, error_of_probe: PyTree, largest: PyTree, y: PyTree) -> Array:

@@ -246,7 +246,7 @@ def _solve(inputs: StepInputs, fixed: _Fixed, by: StepInputs | None) -> PyTree:
     if by is not None and fixed.probe and jtu.tree_leaves((by.step, by.y0)):
         change = direction(inputs.step, y0, (by.step, by.y0), controller)
         y0 = start(inputs.t0, y0, inputs.solver_state, change[1], fixed.project)
-        step = ProbedStep(step, change[0], controller, fixed.project is not None)
+        step = ProbedStep(step, change[0], controller)
         controller = ProbedController(controller)
 
     def outer(cond: Fn, body: Fn, init: PyTree, *, max_steps: int, buffers: Fn) -> PyTree:

@@ -2,13 +2,13 @@
 # ruff: noqa: ARG001 (guards and fields have the arguments that diffrax passes, used or not)
 
 import functools
+from importlib.metadata import version
 from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxlib
 import numpy as np
 import optimistix as optx
 import pytest
@@ -195,7 +195,7 @@ def test_an_event_within_rounding_of_the_start_fires_once() -> None:
     np.testing.assert_array_equal(count, 1.0)
     # XLA of jaxlib 0.10 cancels the tens. From 0.11 on the guard is a staircase, and an event up to 4 stairs early.
     stair = float(np.spacing(np.float32(10.0)))
-    np.testing.assert_allclose(t * rate, y0, atol=10.0 * eps if jaxlib.__version__ < "0.11" else 4.0 * stair)
+    np.testing.assert_allclose(t * rate, y0, atol=10.0 * eps if version("jaxlib").startswith("0.10.") else 4.0 * stair)
 
 
 def test_a_guard_that_starts_at_zero_and_rises_fires_when_it_comes_down() -> None:
