@@ -47,7 +47,7 @@ _GENERAL = (
     "The run reached t1.",
     "The step limit was reached before t1: pass a larger max_steps, a larger dt or looser tolerances.",
     "The step size fell below what the time can resolve: the vector field jumps or is singular there. Pass atol > 0"
-    " where something comes to rest.",
+    " where something comes to rest. In float32 also try a larger rtol.",
     "The vector field gave a value that is not finite (NaN or infinity). A fixed step that is too long for the"
     " stiffness ends the same way: pass a smaller dt, or solver=jaxmodsim.Rodas5P().",
     "The limit of mode changes was reached before t1: pass a larger max_events.",
