@@ -194,7 +194,7 @@ class Belt:
     def simulate(self, p: Any, rtol: Any, **options: Any) -> jms.Trajectory:
         """A run by `jaxmodsim`."""
         given = {"rtol": rtol, "atol": self.atol * rtol} | options
-        return jms.simulate(self.scene(p), jnp.zeros(1), jnp.stack([p[4]]), self.t1, **given)
+        return jms.simulate(self.scene(p), jnp.zeros(1, p.dtype), p[4:], self.t1, **given)
 
     def exact_end(self, p: Any) -> Any:
         """Position [m] at `t1`, in closed form."""

@@ -1,5 +1,6 @@
 """ImplicitFriction: bounded at any step and stiffness, of order 1, and differentiable."""
 
+from importlib.metadata import version
 from typing import Any
 
 import diffrax as dfx
@@ -315,8 +316,8 @@ def test_roots_of_steep_functions(dtype: Any) -> None:
     roots, misfit = jax.jit(jax.vmap(solve))(widths.ravel().astype(dtype), loads.ravel().astype(dtype))
     assert roots.solved.all()
     assert (np.abs(misfit) <= 8e-3 * np.finfo(dtype).eps * loads.ravel().clip(1.0)).all()
-    # 76; 111 where XLA rounds each operation, as from jaxlib 0.11: at a load of 1 the function ends in rounding.
-    assert int(np.max(roots.evaluations)) < 120
+    # 76; from jaxlib 0.11 on 111, as XLA rounds each operation and the function at a load of 1 ends in rounding.
+    assert int(np.max(roots.evaluations)) < (100 if version("jaxlib").startswith("0.10.") else 120)
 
 
 @pytest.mark.parametrize("blocks", [(1, 1, 1), (2, 2)])

@@ -94,9 +94,7 @@ class EventController(AbstractControllerWrapper):
         times: Float[Array, " n"] | None = None,
         direction: Any = None,
     ):
-        self.controller = FiniteSteps.instead(controller)
-        self.times = times
-        self.direction = direction
+        self.controller, self.times, self.direction = FiniteSteps.instead(controller), times, direction
 
     def wrap(self, direction: Real) -> "EventController":
         """Wrap the controller inside."""
@@ -142,8 +140,10 @@ class EventController(AbstractControllerWrapper):
     ) -> tuple[Array, Array, Array, Array, _ControllerState, dfx.RESULTS]:
         """As the wrapped controller, but reject a step that passes an event or does not resolve the guards."""
         old, seen, t0, t1 = controller_state, y1_candidate.report, jnp.asarray(t0), jnp.asarray(t1)
+        # diffrax rejects a step to NaN; a step to infinity has an error of inf / inf, and so has each one after it.
+        y1 = jtu.tree_map(lambda y: jnp.where(jnp.isinf(y), jnp.nan, y), y1_candidate.y)
         keep, inner_t0, inner_t1, jump, inner, result = self.controller.adapt_step_size(
-            t0, t1, y0.y, y1_candidate.y, args, y_error, error_order, old.inner
+            t0, t1, y0.y, y1, args, y_error, error_order, old.inner
         )
         length = _constant(t1 - t0)
         next_root, factor, landed = _constant(seen.next_root), _constant(seen.step_factor), _constant(seen.landed) > 0.5
