@@ -69,7 +69,8 @@ def many_functions(t: Any, q: Any, qd: Any, p: Any) -> Any:
     x, v = q[0], qd[0]
     a = 0.5 + 0.4 * jnp.sin(x) * jnp.cos(v)
     smooth = [jnp.tan(a), jnp.arcsin(a), jnp.arccos(a), jnp.arctan(x), jnp.arctan2(v, a), jnp.sinh(a), jnp.cosh(x)]
-    smooth += [jnp.tanh(v), jnp.exp(v), jnp.expm1(a), jnp.log(a), jnp.log1p(a), jnp.sqrt(a), jnp.cbrt(x), a ** p["n"]]
+    smooth += [jnp.tanh(v), jnp.exp(v), jnp.expm1(a), jnp.log(a), jnp.log1p(a), jnp.sqrt(a), jnp.cbrt(x)]
+    smooth += [jnp.log2(a), jnp.exp2(x), a ** p["n"]]
     smooth += [1.0 / (x**3 + 8.0 * jnp.sign(x)), jax.lax.rsqrt(a), jax.nn.sigmoid(x), jnp.linalg.norm(q - p["at"])]
     bent = [jnp.floor(3.0 * x), jnp.ceil(x * v), jnp.sign(v), jnp.clip(x, -0.5, 0.5), jnp.maximum(x, v), jnp.abs(v)]
     bent += [jnp.where((x > 0) ^ (v > 0), x, v), jnp.where(jnp.isfinite(x) & ~(v <= 0), t, x), jnp.fmod(x, 0.7)]
