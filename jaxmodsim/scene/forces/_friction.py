@@ -218,7 +218,7 @@ class Friction(AbstractEffect):
 
     def _check_direction(self, q: PerDof, params: PyTree, name: str) -> None:
         """Refuse a displacement whose gradient is zero for all q and params; one that vanishes at some is allowed."""
-        if depends_on(lambda q: self.direction(q, params), q):
+        if self.along is None or depends_on(lambda q: self.direction(q, params), q):
             return
         with jax.ensure_compile_time_eval():  # one program: each operation alone would compile as well
             direction = jax.jit(lambda q: self.direction(q, params))(np.ones(q.shape, q.dtype))
