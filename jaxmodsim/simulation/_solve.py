@@ -34,7 +34,7 @@ from ..solvers import (
 )
 from ._integrated_system import AugmentedState, Instant, IntegratedSystem, RunFunctions, Work, project
 from ._outcome import ILL_POSED, MISSED_EVENT, SUCCESS, Ending, describe_failure, end_code, start_code
-from ._run_request import RunRequest
+from ._run_request import TIGHTEST, RunRequest
 
 # Speed of rest, as a part of the absolute tolerance.
 _REST = 1e-3
@@ -114,7 +114,8 @@ def _structured(request: RunRequest) -> bool:
 
 def _tolerances(request: RunRequest) -> tuple[Array, Array]:
     """Relative and absolute tolerance; the latter positive, so that the error of a constant zero is zero, not 0/0."""
-    return request.rtol, jnp.maximum(request.atol, float(jnp.finfo(request.atol.dtype).tiny))
+    kind = jnp.finfo(request.atol.dtype)
+    return jnp.maximum(request.rtol, TIGHTEST * float(kind.eps)), jnp.maximum(request.atol, float(kind.tiny))
 
 
 def _solver(

@@ -21,14 +21,13 @@ from ..scene import Scene
 from ._accuracy import Accuracy, Attempt, CostScaling, evaluations_per_step
 from ._observe import named_series
 from ._outcome import SimulationError
-from ._run_request import MOST_EVENTS, MOST_STEPS, Plugin, RunRequest, run_request
+from ._run_request import MOST_EVENTS, MOST_STEPS, TIGHTEST, Plugin, RunRequest, run_request
 from ._solve import default_solver, solve
 from ._trajectory import Trajectory, trajectory
 
 _ACCURACIES = (1e-12, 1e-1)
-# Range of relative tolerances: a number of rounding units, and a number. Absolute tolerances are this part of them, as
-# by default.
-_TIGHTEST, _LOOSEST, _ABSOLUTE = 50.0, 0.1, 1e-3
+# Largest relative tolerance. Absolute tolerances are this part of the relative ones, as by default.
+_LOOSEST, _ABSOLUTE = 0.1, 1e-3
 # Errors are differences to two references, runs by different methods. In parts of the accuracy: the first tolerance of
 # the references, their admissible difference, and that to two runs with ten times looser tolerances.
 _AHEAD, _AGREE, _NEAR = 1e-2, 0.25, 0.5
@@ -100,7 +99,7 @@ class _AccuracySearch:
 
     @property
     def tightest(self) -> float:
-        return _round(_TIGHTEST * float(jnp.finfo(self.request.q0.dtype).eps))
+        return _round(TIGHTEST * float(jnp.finfo(self.request.q0.dtype).eps))
 
     @property
     def second(self) -> int:

@@ -2,8 +2,10 @@
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +14,8 @@ import pytest
 import jaxmodsim as jms
 from jaxmodsim._core import speed
 from jaxmodsim.scene import scene_numbers
+
+from ..problems import linear_stick_slip
 
 F = np.float32
 Q0, QD0 = jnp.zeros(1, F), jnp.ones(1, F)
@@ -124,3 +128,23 @@ def test_a_bristle_that_overflows_in_a_long_step_is_integrated_by_shorter_ones()
     ends = {kind: jax.jit(lambda x: jax.lax.map(end, x))(jnp.asarray(scale, kind)) for kind in (F, np.float64)}
     assert not np.any(ends[F][1])
     np.testing.assert_allclose(ends[F][0], ends[np.float64][0], rtol=3e-4)
+
+
+def test_velocities_pass_zero_at_the_default_tolerance() -> None:
+    """A box on a spring that sticks to a belt whose velocity swings through zero, for 64 limits."""
+    belt = np.array([[0.2, 0.0, 0.0, 0.3, 0.0, 0.0, 0.0, 0.0, 0.0]])
+    still, one, Fs = np.zeros((1, 9)), np.ones((1, 1)), np.array([1.5])
+    system = linear_stick_slip.LinearStickSlip(one, 0.0 * one, 4.0 * one, one, Fs, Fs, np.array([1.7]), still, belt)
+    scene = jax.tree.map(lambda x: jnp.asarray(x, F), linear_stick_slip.scene(system))
+
+    def run(Fc: Any) -> Any:
+        changed = eqx.tree_at(lambda scene: scene.effects[1].law.Fc, scene, Fc)
+        done = jms.simulate(changed, jnp.zeros(1, F), jnp.full(1, 0.2, F), 12.0, max_steps=4096, throw=False)
+        return done.result.ok, done.q[-1, 0]
+
+    limits = np.linspace(0.97, 1.03, 64)
+    ends = [linear_stick_slip.motion(replace(system, Fc=np.array([Fc])), [0.0], [0.2], 12.0).q[0] for Fc in limits]
+    ok, q = jax.jit(lambda x: jax.lax.map(run, x))(jnp.asarray(limits, F))
+    assert ok.all()
+    assert q.dtype == F
+    np.testing.assert_allclose(q, ends, atol=1e-4)
