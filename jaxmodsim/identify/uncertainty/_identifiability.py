@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import equinox as eqx
@@ -290,26 +289,14 @@ def _listed(names: Iterable[str]) -> str:
     return " and ".join(", ".join(names).rsplit(", ", 1))
 
 
-@dataclass(frozen=True)
-class SloppyDirection:
-    """A combined change of parameters that hardly changes the output.
-
-    - `names`: of its parameters, the strongest first.
-    - `changes`: their changes relative to the scale of the estimate or the start, whichever is larger; the largest 1.
-    - `error`: standard error along it, relative in the same way.
-    - `sentence`: in words.
-    """
-
-    names: tuple[str, ...]
-    changes: tuple[float, ...]
-    error: float
-    sentence: str
-
-
 def sloppy_directions(
     estimate: ParameterEstimate, diagnostics: FitDiagnostics, left_out: Collection[str]
-) -> list[SloppyDirection]:
-    """Weak directions of the Fisher information in relative parameters, the weakest first."""
+) -> list[IdentifiabilityIssue]:
+    """Weak directions of the Fisher information in relative parameters, the weakest first.
+
+    Each is a combined change of parameters, named in the order of their shares, that hardly changes the output. A
+    change is relative to the scale of the estimate or the start, whichever is larger.
+    """
     errors = estimate.errors
     names = [
         name
@@ -332,11 +319,11 @@ def sloppy_directions(
             continue
         parts = tuple(names[i] for i in order)
         sentence = _sentence(estimate, parts, vector[order], error, size[order])
-        directions.append(SloppyDirection(parts, tuple(float(vector[i]) for i in order), error, sentence))
+        directions.append(IdentifiabilityIssue(sentence, parts))
 
-    def is_arbitrary(direction: SloppyDirection) -> bool:
+    def is_arbitrary(direction: IdentifiabilityIssue) -> bool:
         # Every combination of its parameters is weak, so that none is to be named.
-        return sum(set(other.names) <= set(direction.names) for other in directions) >= len(direction.names)
+        return sum(set(other.about) <= set(direction.about) for other in directions) >= len(direction.about)
 
     return [direction for direction in directions if not is_arbitrary(direction)]
 

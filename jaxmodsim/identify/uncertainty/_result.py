@@ -247,7 +247,7 @@ def warnings_for(result: FitResult) -> tuple[str, ...]:
             sentences.append(f"{name} ended on its limit {value:g}.")
     directions = sloppy_directions(estimate, diagnostics, explained)
     sentences += [direction.sentence for direction in directions]
-    named = explained | {name for direction in directions for name in direction.names}
+    named = explained | {name for direction in directions for name in direction.about}
     for name, value in estimate.values.items():
         share = errors[name] / scale if (scale := estimate.scale(name)) else np.inf
         if _UNKNOWN < share < np.inf and value not in bounds[name] and name not in named:
