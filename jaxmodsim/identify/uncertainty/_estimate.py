@@ -181,25 +181,6 @@ class CovarianceEstimate(NamedTuple):
     refused: bool = False
 
 
-def block_numbers(
-    weights: Float[np.ndarray, "runs samples"], channels: int, blocks: int = BLOCKS
-) -> tuple[Int[np.ndarray, " rows"], int]:
-    """Number of the block of each sample row, in the order of the residual, and the number of blocks.
-
-    All channels of a time are in one block. Runs share the blocks by their numbers of samples.
-    """
-    samples = weights.shape[1]
-    counts = np.sum(weights > 0, axis=1).tolist()
-    whole = sum(counts)
-    numbers, used = [], 0
-    for count in counts:
-        own = max(round(blocks * count / whole), 1)
-        here = np.minimum(np.arange(samples) * own // max(count, 1), own - 1)
-        numbers.append(np.tile(used + here, channels))
-        used += own
-    return np.concatenate(numbers), used
-
-
 def covariance_estimate(
     residual: Float[np.ndarray, " rows"],
     jacobian: Float[np.ndarray, "rows n"],
@@ -466,16 +447,24 @@ def derivatives_hold(problem: FitProblem, state: SearchState) -> bool:
 
 
 def sample_blocks(problem: FitProblem, blocks: int = BLOCKS) -> tuple[Int[np.ndarray, " rows"], int]:
-    """Block of each sample row, and the number of blocks."""
+    """Number of the block of each sample row, in the order of the residual, and the number of blocks.
+
+    All channels of a time are in one block. Runs share the blocks by their numbers of samples.
+    """
     weight = np.max(np.stack([np.asarray(each) for each in problem.runs.weight.values()]), axis=0)
-    numbers, count = block_numbers(weight, 1, blocks)
-    time = numbers.reshape(problem.count, -1)
+    counts = np.sum(weight > 0, axis=1).tolist()
+    numbers, used = [], 0
+    for count in counts:
+        own = max(round(blocks * count / sum(counts)), 1)
+        numbers.append(used + np.minimum(np.arange(weight.shape[1]) * own // max(count, 1), own - 1))
+        used += own
+    time = np.stack(numbers)
     parts = [time] * len(problem.runs.weight)
     for effect in sorted(problem.runs.slips):
         ts, instants = np.asarray(problem.runs.t), np.asarray(problem.runs.slips[effect])
         nearest = np.stack([np.searchsorted(t, own) for t, own in zip(ts, instants, strict=True)])
         parts.append(np.take_along_axis(time, np.minimum(nearest, time.shape[1] - 1), axis=1))
-    return np.concatenate(parts, axis=1).reshape(-1), count
+    return np.concatenate(parts, axis=1).reshape(-1), used
 
 
 def _passes_for_white(problem: FitProblem, residual: Float[np.ndarray, " rows"]) -> bool:
