@@ -31,7 +31,7 @@ SINE, SLOW_SINE = np.sin(2 * np.pi * T), np.sin(2 * np.pi * 0.5 * T)
 
 
 def element(law, x, numbers=None, alike=None):
-    slip = Slip(T, x, np.gradient(x, T))
+    slip = Slip(x, np.gradient(x, T))
     own = numbers or {k: float(v) for k, v in LUGRE.items()}
     return Element("", law, (slip,), {k: np.asarray(v) for k, v in own.items()}, tuple(own), alike or {})
 

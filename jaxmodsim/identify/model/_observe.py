@@ -123,9 +123,8 @@ class RecordedMotion(NamedTuple):
 
 
 class Slip(NamedTuple):
-    """Slip of a friction element: times [s], displacement [m or rad] and velocity, shape `[samples]` each."""
+    """Slip of a friction element: displacement [m or rad] and velocity, shape `[samples]` each."""
 
-    t: Float[np.ndarray, " samples"]
     x: Float[np.ndarray, " samples"]
     v: Float[np.ndarray, " samples"]
 
@@ -182,7 +181,7 @@ def slip_of(effect: Friction | None, motion: RecordedMotion, params: PyTree, dof
         v = np.asarray(_slips(effect, params, *(on_device(each) for each in (motion.t, q, qd))))
     if v.ndim > 1 or not np.isfinite(v).all():
         return None
-    return Slip(motion.t, np.concatenate([[0.0], np.cumsum(0.5 * np.diff(motion.t) * (v[1:] + v[:-1]))]), v)
+    return Slip(np.concatenate([[0.0], np.cumsum(0.5 * np.diff(motion.t) * (v[1:] + v[:-1]))]), v)
 
 
 @eqx.filter_jit
