@@ -246,11 +246,6 @@ class FreeParameters(eqx.Module):
             start[each.name] = max(values[each.name], _floor(floors[each.name], values) if inside else -math.inf)
         return FreeParameters(tuple(free), entries, {name: on_device(x) for name, x in start.items()})
 
-    @staticmethod
-    def none() -> "FreeParameters":
-        """Nothing is free."""
-        return FreeParameters((), (), {})
-
     @property
     def following(self) -> dict[str, str]:
         """The base of each parameter that is not free but follows one that is, by name."""

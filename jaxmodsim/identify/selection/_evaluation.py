@@ -272,7 +272,7 @@ def _record_problem(result: FitResult, record: Record, start: Mapping[str, Recor
     q, qd = states
     return FitProblem(
         engine,
-        FreeParameters.none(),
+        FreeParameters((), (), {}),
         tuple(f"{x}[{i}]" for x in start for i in range(dof)),
         State(q, qd, jax.tree.map(lambda x: jnp.asarray(x)[None], scene.initial_state(q[0]))),
         runs,
