@@ -198,7 +198,7 @@ def solve(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) ->
             f"{counted} samples are too few for {unknown} unknowns: free parameters and unknown initial states."
         )
     rtol = on_device(np.asarray(options.rtol, x.dtype))
-    state, best, rounds = start_search(x, problem.rows), None, 0
+    state, rounds = start_search(x, problem.rows), 0
     at = f"after {_ROUND} iterations each"
     try:
         for iteration in range(1, options.max_steps + 1):
@@ -212,7 +212,6 @@ def solve(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) ->
                     "The model gives values that are not finite at the start of the fit: check the start values, or"
                     " take more substeps."
                 )
-            best = state
             if options.progress is not None:
                 values = problem.at(state.x).values
                 shown = {name: float(values[name]) for name in problem.free.names}
@@ -220,9 +219,9 @@ def solve(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) ->
             if int(state.done):
                 return SearchResult(problem, state, int(state.steps), continued(ENDINGS[int(state.done)], rounds, at))
     except KeyboardInterrupt:
-        if best is None:
+        if not np.isfinite(float(state.cost)):
             raise
-        return SearchResult(problem, best, int(best.steps), "interrupted; these are the best values so far")
+        return SearchResult(problem, state, int(state.steps), "interrupted; these are the best values so far")
     ending = f"stopped at the limit of {options.max_steps} iterations (max_steps)"
     return SearchResult(problem, state, int(state.steps), continued(ending, rounds, at))
 
