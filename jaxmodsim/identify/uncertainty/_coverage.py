@@ -12,8 +12,7 @@ from jaxtyping import Float
 from ..._core.arguments import as_share, as_whole
 from ..._core.readable import AbstractReadable, Table, table_of
 from ..estimate._initializers import AbstractInitializer, problem_at, run_initializers, side_by_side, starts_of
-from ..estimate._problem import FitProblem
-from ..estimate._search import SearchOptions, SearchState
+from ..estimate._search import SearchOptions
 from ._estimate import covariance_of, interval
 from ._result import FitResult
 
@@ -97,21 +96,22 @@ def coverage(
         lambda p: p.runs.measured[name], jtu.tree_map(lambda _: None, problem), 0, is_leaf=lambda x: x is None
     )
     options = SearchOptions(max_steps=steps)
-    starts = []
-    for measured in truth + noise:
-        one = eqx.tree_at(lambda p: p.runs.measured[name], problem, jnp.asarray(measured))
-        starts.append(run_initializers(initializer, one.held, options)[0])
-    x = jnp.stack(starts)
+    repeated = [problem_at(several, axes, i) for i in range(repeats)]
+    x = jnp.stack([run_initializers(initializer, one.held, options)[0] for one in repeated])
     if problem.nuisance:
         x = side_by_side(several.held, axes, starts_of(problem, x), options, steps).x
     state = side_by_side(several, axes, starts_of(problem, x), options, steps)
-    values, errors = _estimates(several, axes, state)
-    names, estimate = problem.free.names, result.estimate
+    states, names, estimate = jtu.tree_map(np.asarray, state), problem.free.names, result.estimate
+    ends = [jtu.tree_map(lambda x, i=i: x[i], states) for i in range(repeats)]
+    values = np.stack([problem.at(end.x).vector for end in ends])
+    covariances = [
+        covariance_of(one, end, range(len(names))).covariance for one, end in zip(repeated, ends, strict=True)
+    ]
+    errors = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     shares = {}
     for k, each in enumerate(names):
-        true, log = estimate.values[each], each in estimate.logarithmic
-        limits = [estimate.bounds[each]] * repeats
-        spans = [interval(v, e, b, log, level) for v, e, b in zip(values[:, k], errors[:, k], limits, strict=True)]
+        true, limits, log = estimate.values[each], estimate.bounds[each], each in estimate.logarithmic
+        spans = [interval(x, error, limits, log, level) for x, error in zip(values[:, k], errors[:, k], strict=True)]
         shares[each] = float(np.mean([low <= true <= high for low, high in spans]))
     return Coverage(
         level=level,
@@ -130,13 +130,3 @@ def _correlated(white: np.ndarray, memory: float) -> np.ndarray:
     driving = np.sqrt(1 - memory**2) * white
     driving[..., 0] = white[..., 0]
     return np.asarray(signal.lfilter([1.0], [1.0, -memory], driving))
-
-
-def _estimates(problem: FitProblem, axes: FitProblem, state: SearchState) -> tuple[np.ndarray, np.ndarray]:
-    """Parameters and standard errors of every repeat, shape `[repeats, free]`."""
-    states, values, errors = jtu.tree_map(np.asarray, state), [], []
-    for i in range(state.x.shape[0]):
-        one, here = problem_at(problem, axes, i), jtu.tree_map(lambda x, i=i: x[i], states)
-        values.append(problem.at(here.x).vector)
-        errors.append(np.sqrt(np.diagonal(covariance_of(one, here, range(len(problem.free.names))).covariance)))
-    return np.stack(values), np.stack(errors)
