@@ -308,7 +308,7 @@ def comparison_of(
     effective = effective_samples(searches[min(fitted, key=lambda name: fitted[name])])
     losses = {name: _losses(each.held, searches[name].problem.loss, levels) for name, each in kept.items()}
     count = np.array([sum(len(x) for x in part.values()) for part in next(iter(kept.values())).held])
-    means = {name: float(np.sum(count * loss) / np.sum(count)) for name, loss in losses.items()}
+    means = {name: float(np.average(loss, weights=count)) for name, loss in losses.items()}
     expected = dict(means) if new_records else _expected(means, kept, searches, levels)
     order = sorted(expected, key=lambda name: expected[name])
     best = order[0]
@@ -323,12 +323,10 @@ def comparison_of(
         error = _standard_error(losses[name], count) / (2 * held_out) if held_out > 0 else 0.0
         difference = _standard_error(losses[name] - losses[best], count)
         difference = max(difference / (root + least) if root + least else 0.0, ENOUGH * root)
-        starts = kept[name].start_fitted
         start_fitted = None
-        if starts:
-            weights = [sum(len(x) for x in part.values()) for part in starts]
+        if starts := kept[name].start_fitted:
             loss = _losses(starts, searches[name].problem.loss, levels)
-            start_fitted = float(np.sqrt(np.average(loss, weights=weights)))
+            start_fitted = float(np.sqrt(np.average(loss, weights=count)))
         ranked.append(
             Ranked(
                 name=name,
