@@ -336,18 +336,12 @@ def _bases(
     observables: Observables,
 ) -> State:
     """Initial state of each run: that of its record, or what was measured where a window begins."""
-    dof = states.q.shape[1]
-    q, qd = [], []
-    for i, first in zip(windows.record, windows.first, strict=True):
-        if first == 0:
-            q.append(np.asarray(states.q)[i])
-            qd.append(np.asarray(states.qd)[i])
-            continue
-        rest = records[i].samples(first, len(records[i].t))
-        start = measured_start(rest, observables, dof)
-        q.append(start[0])
-        qd.append(start[1])
-    return initial_states(scene, *(on_device(np.stack(each)) for each in (q, qd)))
+    q, qd = (np.asarray(each)[list(windows.record)] for each in (states.q, states.qd))
+    for run, (i, first) in enumerate(zip(windows.record, windows.first, strict=True)):
+        if first > 0:
+            rest = records[i].samples(first, len(records[i].t))
+            q[run], qd[run] = measured_start(rest, observables, q.shape[1])
+    return initial_states(scene, on_device(q), on_device(qd))
 
 
 def _engine(

@@ -421,10 +421,8 @@ def _measured_starts(search: SearchResult, options: CompareOptions) -> State:
     base = search.problem.base
     assert base is not None
     observables = by_channel(options.fit.observe, options.hold_out)
-    q, qd = [], []
-    for record in options.hold_out:
-        start = measured_start(record, observables, base.q.shape[1])
-        # What was not measured comes as zero.
-        q.append(np.where(start[0] != 0, start[0], base.q[0]))
-        qd.append(np.where(start[1] != 0, start[1], base.qd[0]))
-    return initial_states(search.problem.engine.model, jnp.asarray(np.stack(q)), jnp.asarray(np.stack(qd)))
+    starts = [measured_start(record, observables, base.q.shape[1]) for record in options.hold_out]
+    q, qd = (np.stack(each) for each in zip(*starts, strict=True))
+    # Coordinates and velocities that are not measured are zero.
+    q, qd = np.where(q != 0, q, base.q[0]), np.where(qd != 0, qd, base.qd[0])
+    return initial_states(search.problem.engine.model, jnp.asarray(q), jnp.asarray(qd))
