@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TypeAlias
 
 import equinox as eqx
@@ -151,9 +150,26 @@ def compare(
     else:
         _check_scenes(models, options)
     sizes = {name: len(ranges_of(each.scene) if laws else each.free or ()) for name, each in models.items()}
+    if not models:
+        raise ValueError("There must be one candidate at least.")
+    order = sorted(models, key=lambda name: sizes[name])
+    judged: dict[str, CrossValidated] = {}
+    failures: dict[str, str] = {}
+    judge = _validate_law if laws else _validate_scene
+    with reported(progress, "compare", candidate_words) as report:
+        for name in order:
+            try:
+                judged[name] = judge(options, name, models[name], report, judged)
+            except KeyboardInterrupt:
+                if not judged:
+                    raise
+                break
+            except RuntimeError as error:
+                failures[name] = str(error).splitlines()[0]
+    left = tuple(name for name in order if name not in judged and name not in failures)
+    descriptions = {name: candidate.description for name, candidate in models.items()}
     by = ", ".join(record.name for record in options.hold_out) or f"{options.folds} folds"
-    judge = partial(_validate_law if laws else _validate_scene, options)
-    return _compared(models, sizes, judge, by, progress, new_records=bool(options.hold_out))
+    return comparison_of(judged, failures, left, descriptions, by, new_records=bool(options.hold_out))
 
 
 def _check_scenes(models: Mapping[str, Candidate], options: CompareOptions) -> None:
@@ -202,36 +218,6 @@ def _from_smaller(free: Sequence[str], judged: Mapping[str, CrossValidated]) -> 
     ]
     nested = [values for values in fitted if set(values) <= names]
     return (FromSmaller(max(nested, key=len)),) if nested else ()
-
-
-def _compared(
-    candidates: Mapping[str, Candidate],
-    sizes: Mapping[str, int],
-    judge: Callable[[str, Candidate, CompareProgress | None, Mapping[str, CrossValidated]], CrossValidated],
-    by: str,
-    progress: bool | CompareProgress,
-    *,
-    new_records: bool,
-) -> Comparison:
-    """Judge the candidates in the order of their sizes, each with the earlier ones; keep the reasons of failures."""
-    if not candidates:
-        raise ValueError("There must be one candidate at least.")
-    order = sorted(candidates, key=lambda name: sizes[name])
-    judged: dict[str, CrossValidated] = {}
-    failures: dict[str, str] = {}
-    with reported(progress, "compare", candidate_words) as report:
-        for name in order:
-            try:
-                judged[name] = judge(name, candidates[name], report, judged)
-            except KeyboardInterrupt:
-                if not judged:
-                    raise
-                break
-            except RuntimeError as error:
-                failures[name] = str(error).splitlines()[0]
-    left = tuple(name for name in order if name not in judged and name not in failures)
-    description = {name: candidate.description for name, candidate in candidates.items()}
-    return comparison_of(judged, failures, left, description, by, new_records=new_records)
 
 
 def _finished(search: SearchResult | None) -> SearchResult:
