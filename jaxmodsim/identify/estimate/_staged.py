@@ -128,17 +128,14 @@ def _sizes(problem: FitProblem, sampled: _Sampled, values: dict[str, float]) -> 
     """Sizes that go with a unit."""
     speed = float(jnp.max(jnp.abs(sampled.v))) or 1.0
     travel = float(jnp.max(sampled.q) - jnp.min(sampled.q)) or 1.0
-    if sampled.force is not None:
-        force = float(jnp.sqrt(jnp.mean(sampled.force**2)))
-    else:
-        frictionless = _required(problem, values)
-        force = float(jnp.sqrt(jnp.mean(jax.vmap(frictionless)(sampled) ** 2)))
-    force = force or 1.0
+    force = float(jnp.sqrt(jnp.mean(_required(problem, sampled, values) ** 2))) or 1.0
     return {"N": force, "m/s": 0.05 * speed, "N s/m": 0.1 * force / speed, "N/m": 1e2 * force / travel}
 
 
-def _required(problem: FitProblem, values: Mapping[str, ArrayLike]) -> Callable[[_Sampled], Array]:
-    """Generalised friction force at a sample, by the equations of motion without friction."""
+def _required(problem: FitProblem, sampled: _Sampled, values: Mapping[str, ArrayLike]) -> Float[Array, " samples"]:
+    """Generalised friction force: measured, or by the equations of motion without friction."""
+    if sampled.force is not None:
+        return sampled.force
     scene = with_values(problem.engine.model, values)
     others = tuple(effect for effect in scene.effects if not isinstance(effect, Friction))
 
@@ -149,7 +146,7 @@ def _required(problem: FitProblem, values: Mapping[str, ArrayLike]) -> Callable[
         free = vector_field(s.t, State(q, qd, bare.initial_state(q)), bare).qd[0]
         return mass_of(here, s.t, q, qd) * (free - s.a)
 
-    return required
+    return jax.vmap(required)(sampled)
 
 
 def _settled(law: AbstractLaw, v: Array) -> Array:
@@ -224,9 +221,7 @@ def _balance_step(problem: FitProblem, sampled: _Sampled, state: SearchState, rt
 
     def residual(x: Array) -> Array:
         values = problem.free.values(x)
-        if sampled.force is not None:
-            return steady * (jax.vmap(_friction(problem, values))(sampled) - sampled.force)
-        return steady * jax.vmap(lambda s: _friction(problem, values)(s) - _required(problem, values)(s))(sampled)
+        return steady * (jax.vmap(_friction(problem, values))(sampled) - _required(problem, sampled, values))
 
     lower, upper = problem.free.bounds
     box = Box(lower, upper, problem.free.longest)
@@ -235,12 +230,7 @@ def _balance_step(problem: FitProblem, sampled: _Sampled, state: SearchState, rt
 
 def _reversal_slope(problem: FitProblem, sampled: _Sampled, values: dict[str, float]) -> float | None:
     """Median slope [N/m] of the friction force over the displacement after reversals, until its sign has changed."""
-    x = np.asarray(sampled.q)
-    if sampled.force is not None:
-        force = np.asarray(sampled.force)
-    else:
-        force = np.asarray(jax.jit(jax.vmap(_required(problem, values)))(sampled))
-    v = np.asarray(sampled.v)
+    x, v, force = (np.asarray(each) for each in (sampled.q, sampled.v, _required(problem, sampled, values)))
     level = np.median(np.abs(force))
     turns = np.flatnonzero(np.sign(v[1:]) * np.sign(v[:-1]) < 0) + 1
     slopes = []
