@@ -1,6 +1,7 @@
 """`design_input`: the most informative input for the next measurement, by gradients of the Fisher information."""
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import TypeAlias
 
 import equinox as eqx
@@ -401,21 +402,17 @@ def _climb(
     task: _Task, start: np.ndarray, lengths: np.ndarray, max_steps: int, progress: DesignProgress | None, count: int
 ) -> tuple[Float[np.ndarray, " weights"], str, int]:
     """Improve the criterion by SLSQP; returns also the ending and the number of iterations so far."""
-    seen: dict[bytes, list[np.ndarray]] = {}
+
+    @lru_cache(maxsize=1)
+    def judged_at(weights: bytes) -> list[np.ndarray]:
+        judgement = [np.asarray(x, float) for x in _judge(task, jnp.asarray(lengths * np.frombuffer(weights), float))]
+        if all(np.isfinite(x).all() for x in judgement):
+            return judgement
+        # Far beyond the limits the model is not finite: a bad value makes the line search turn back.
+        return [np.full_like(x, _NOT_FINITE if i == 0 else 0.0) for i, x in enumerate(judgement)]
 
     def judged(y: np.ndarray) -> list[np.ndarray]:
-        key = y.tobytes()
-        if key not in seen:
-            seen.clear()
-            judgement = [np.asarray(x, float) for x in _judge(task, jnp.asarray(lengths * y, float))]
-            # Far beyond the limits the model is not finite: a bad value makes the line search turn back.
-            finite = all(np.isfinite(x).all() for x in judgement)
-            seen[key] = (
-                judgement
-                if finite
-                else [np.full_like(x, _NOT_FINITE if i == 0 else 0.0) for i, x in enumerate(judgement)]
-            )
-        return seen[key]
+        return judged_at(y.tobytes())
 
     from scipy import optimize  # slow to import, and only needed here
 
