@@ -456,9 +456,12 @@ def _excitation(
     """A motion with its force, a run of the model, and the information in a record."""
     q_ref, qd_ref, force, q, qd, columns = (np.asarray(each, float) for each in _run(task, jnp.asarray(x, float)))
     information = columns.T @ columns
-    covariance = _inverse(information + np.asarray(task.prior, float))
-    errors = np.sqrt(np.diag(covariance))
-    absolute = dict(zip(names, (errors * scale).tolist(), strict=True))
+    whole = information + np.asarray(task.prior, float)
+    silent, covariance = np.diag(whole) == 0, floored_inverse(whole, _LEAST)
+    # Numbers without effect are not known at all.
+    covariance[silent, :], covariance[:, silent] = 0.0, 0.0
+    covariance[silent, silent] = np.inf
+    errors = np.sqrt(np.diag(covariance)) * scale
     return Excitation(
         t=np.asarray(task.t, float),
         q_ref=q_ref,
@@ -467,7 +470,7 @@ def _excitation(
         q=q,
         qd=qd,
         information=information,
-        errors=absolute,
+        errors=dict(zip(names, errors.tolist(), strict=True)),
         correlation=correlation_of(covariance),
     )
 
@@ -478,11 +481,3 @@ def _run(task: _Task, x: Float[Array, " weights"]) -> tuple[Array, ...]:
     axis, (q_ref, qd_ref) = task.axis, task.motion(x)
     force = feed_forward(axis, task.t, q_ref, qd_ref)
     return q_ref, qd_ref, force, *driven_motion(axis, task.t, force), sensitivities(axis, task.t, force)[1]
-
-
-def _inverse(information: Float[np.ndarray, "free free"]) -> Float[np.ndarray, "free free"]:
-    """Inverse with eigenvalues bounded from below; infinite variance where nothing is known."""
-    silent, inverse = np.diag(information) == 0, floored_inverse(information, _LEAST)
-    inverse[silent, :], inverse[:, silent] = 0.0, 0.0
-    inverse[silent, silent] = np.inf
-    return inverse
