@@ -24,10 +24,6 @@ from ..model._parameters import FreeParameters, chosen_entries, split_entries, s
 from ._problem import AbstractLoss, FitProblem, Prior, SquaredLoss, local_names
 from ._search import SearchResult, channels_seen
 
-# Largest number of mode changes in one run by events.
-_MAX_EVENTS = 1024
-# Absolute tolerance of runs by events, relative to the relative one.
-_ATOL_SHARE = 1e-3
 # Factor of the integration steps that shows their error in the output.
 _FINER = 4
 
@@ -362,9 +358,7 @@ def _engine(
             "A controller runs with fixed steps, which pass stick and slip along a line, but neither constraints, nor"
             " slip in a plane, nor slip instants in a record: wrap the laws, as in Regularized(law, width)."
         )
-    return EventEngine(
-        scene, delays, observables, linear, slips, options.accuracy, _ATOL_SHARE * options.accuracy, _MAX_EVENTS
-    )
+    return EventEngine(scene, delays, observables, linear, slips, options.accuracy)
 
 
 def noise_level(channel: str, records: tuple[Record, ...]) -> float:

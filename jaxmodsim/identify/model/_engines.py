@@ -43,6 +43,8 @@ Observe: TypeAlias = Callable[[Array, State, Scene, Array | None], PyTree[Array]
 Inputs: TypeAlias = dict[str, Float[Array, " samples"]]
 # Largest number of steps of a run by events; each sample of a held input ends a step.
 _STEPS_A_RUN, _STEPS_A_SAMPLE = 16384, 4
+# Largest number of mode changes in a run by events; its absolute tolerance, relative to the relative one.
+_MAX_EVENTS, _ATOL_SHARE = 1024, 1e-3
 # Prefix of the names of delays of inputs.
 DELAY = "delay."
 _Model = TypeVar("_Model", bound=eqx.Module)
@@ -338,8 +340,6 @@ class EventEngine(eqx.Module):
     linear: frozenset[str] = eqx.field(static=True)
     slips: tuple[str, ...] = eqx.field(static=True)
     rtol: float = eqx.field(static=True)
-    atol: float = eqx.field(static=True)
-    max_events: int = eqx.field(static=True)
 
     def __call__(self, values: dict[str, Array], start: State, run: Runs) -> ModelOutput:
         """Run the scene with these values over the samples."""
@@ -355,9 +355,9 @@ class EventEngine(eqx.Module):
             ts=run.t,
             z0=start.z,
             rtol=self.rtol,
-            atol=self.atol,
+            atol=_ATOL_SHARE * self.rtol,
             max_steps=_STEPS_A_RUN + _STEPS_A_SAMPLE * run.t.shape[0],
-            max_events=self.max_events,
+            max_events=_MAX_EVENTS,
             throw=False,
         )
         fine = done.code == 0
