@@ -1,6 +1,7 @@
 """Signals of a record: smoothed, differentiated, their noise and outliers, gaps in time, and the offset of a clock."""
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -154,26 +155,11 @@ def sampling_gaps(record: Record) -> tuple[int, ...]:
     return tuple(long.tolist()) if long.size <= max(_FEW * steps.size, 1) else ()
 
 
-class _Regression(NamedTuple):
-    """Regression of a force on the motion of a record: the regressors of moving samples, as an orthonormal basis.
+def _regression(record: Record, name: str, furthest: int) -> Callable[[float], tuple[float, float]] | None:
+    """Regression of a force on the motion: acceleration, velocity, its sign, and one. None for a short motion.
 
-    - `basis`, shape `[moving, 4]`, at the times `t`. `middle`, `force`: the force, smoothed like the motion.
+    The function returns the sums of squares of the residual of the force `offset` [s] earlier, and of its scatter.
     """
-
-    basis: Float[np.ndarray, "moving 4"]
-    t: Float[np.ndarray, " moving"]
-    middle: Float[np.ndarray, " samples"]
-    force: Float[np.ndarray, " samples"]
-
-    def residual(self, offset: float) -> tuple[float, float]:
-        """Sum of squares of the residual of the force `offset` [s] earlier, and of its scatter."""
-        shifted = np.interp(self.t - offset, self.middle, self.force)
-        residual = shifted - self.basis @ (self.basis.T @ shifted)
-        return float(residual @ residual), float(np.sum((shifted - np.mean(shifted)) ** 2))
-
-
-def _regression(record: Record, name: str, furthest: int) -> _Regression | None:
-    """Regressors of the force: acceleration, velocity, its sign, and one. None for a short motion."""
     t, span, u = record.t, smooth_span(len(record.t)), record.inputs[name]
     edge = 2 * span + furthest + 2
     if len(t) <= 2 * edge or not np.ptp(u) or not np.ptp(record.measured):
@@ -190,7 +176,14 @@ def _regression(record: Record, name: str, furthest: int) -> _Regression | None:
     columns = np.column_stack([np.gradient(v, t), v, smoothed(np.sign(v)), np.ones_like(v)])[moving]
     basis = np.linalg.qr(columns / np.maximum(np.linalg.norm(columns, axis=0), _TINY))[0]
     # A held value belongs to the interval after it.
-    return _Regression(basis, t[moving], t + 0.5 * float(np.median(np.diff(t))), smoothed(u))
+    middle, force = t + 0.5 * float(np.median(np.diff(t))), smoothed(u)
+
+    def squares(offset: float) -> tuple[float, float]:
+        shifted = np.interp(t[moving] - offset, middle, force)
+        residual = shifted - basis @ (basis.T @ shifted)
+        return float(residual @ residual), float(np.sum((shifted - np.mean(shifted)) ** 2))
+
+    return squares
 
 
 def unexplained_force(record: Record, name: str = "u") -> float:
@@ -207,7 +200,7 @@ def unexplained_force(record: Record, name: str = "u") -> float:
     regression = _regression(record, name, 0)
     if regression is None:
         return 0.0
-    residual, scatter = regression.residual(0.0)
+    residual, scatter = regression(0.0)
     return residual / max(scatter, _TINY)
 
 
@@ -232,7 +225,7 @@ def clock_offset(record: Record, name: str = "u") -> tuple[float, float]:
         return 0.0, 1.0
 
     def squares(offset: float) -> float:
-        return regression.residual(offset)[0]
+        return regression(offset)[0]
 
     def least(first: int, last: int, step: int) -> int:
         return min(range(max(first, -furthest), min(last, furthest) + 1, step), key=lambda k: squares(interval * k))
