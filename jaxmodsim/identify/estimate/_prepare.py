@@ -107,12 +107,7 @@ class Prepared:
 
 
 def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str], options: FitOptions) -> Prepared:
-    """Check everything and build the problem.
-
-    **Raises:**
-
-    - `ValueError` as `fit` does.
-    """
+    """Check everything, with the errors of `fit`, and build the problem."""
     several = records_of(records)
     _check_inputs(scene, several)
     for _, module in modules_of(scene):

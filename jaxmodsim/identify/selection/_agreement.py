@@ -364,11 +364,9 @@ def covariances(result: FitResult, variation: float, agreement: RecordAgreement 
 
 
 def mean_variances(search: SearchResult, covariance: _Matrix) -> dict[str, float]:
-    """Mean variance of the output at the fitted samples, by channel, in squared noise levels, linearised.
+    """Mean variance of the output at the fitted samples, by channel, in squared noise levels.
 
-    **Arguments:**
-
-    - `covariance`: of the free parameters, by the same derivatives.
+    Linearised, by the derivatives that also gave the covariance of the free parameters.
     """
     problem, size = search.problem, len(search.problem.free.names)
     slopes = problem.at(search.state.x).slopes
@@ -380,17 +378,12 @@ def mean_variances(search: SearchResult, covariance: _Matrix) -> dict[str, float
 def output_changes(
     search: SearchResult, covariance: _Matrix, output: Callable[[Float[Array, " free"]], Mapping[str, Array]]
 ) -> list[dict[str, np.ndarray]]:
-    """Changes of an output, by channel, whose squares sum up to its variance.
+    """Changes of an output, by channel, whose squares sum up to its variance by that of the free parameters.
 
     One for each principal axis of the covariance: a central difference over sqrt(3) standard deviations (Norgaard,
     Poulsen, Ravn 2000, Automatica 36:1627), as the derivatives of stick-slip motions hold over much shorter distances.
     Beyond a tenth in the coordinates of the fit the change is taken as linear: models there have little to do with the
     records.
-
-    **Arguments:**
-
-    - `covariance`: of the free parameters.
-    - `output`: the output at coordinates of the free parameters.
     """
     size, here = len(search.problem.free.names), search.problem.at(search.state.x)
     x = np.asarray(search.state.x)[:size]

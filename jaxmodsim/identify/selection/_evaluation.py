@@ -57,12 +57,7 @@ def opening(runs: Runs) -> Bool[np.ndarray, "runs samples"]:
 
 
 def check_lengths(records: Iterable[Record], numbers: int) -> None:
-    """Refuse records, or parts of them, half of which cannot show this many numbers of a state.
-
-    **Raises:**
-
-    - `ValueError` naming the record.
-    """
+    """Refuse records, or parts of them, half of which cannot show this many numbers of a state."""
     for record in records:
         if len(record.t) // 2 <= numbers:
             raise ValueError(

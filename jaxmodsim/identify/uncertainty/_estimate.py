@@ -275,14 +275,10 @@ def _chance(scores: Float[np.ndarray, "scores n"], difference: Float[np.ndarray,
 
 
 def floored_inverse(matrix: Float[np.ndarray, "n n"], least: float) -> Float[np.ndarray, "n n"]:
-    """Inverse of a normal matrix, with eigenvalues bounded from below in columns of unit length.
+    """Inverse of a normal matrix, with eigenvalues of at least the share `least` of the largest one.
 
-    A direction that the record does not determine gets a huge error.
-
-    **Arguments:**
-
-    - `matrix`: symmetric, shape `[n, n]`. A column of zeros counts as one of unit length.
-    - `least`: smallest eigenvalue, as a share of the largest one.
+    They are those in columns of unit length; a column of zeros counts as one. A direction that the record does not
+    determine gets a huge error.
     """
     root = _floored_root(matrix, least)
     return root @ root.T
@@ -313,15 +309,8 @@ def interval(
 ) -> tuple[float, float]:
     """Interval by Student's t, with one degree of freedom less than blocks of samples.
 
-    For a parameter that must stay above its lower limit, it is symmetric in the logarithm of the distance from it. For
-    others it is cut at the limits.
-
-    **Arguments:**
-
-    - `value`, `error`: estimate and its standard error.
-    - `limits`: lower and upper limit of the parameter, infinite for none.
-    - `logarithmic`: whether it must stay above its lower limit.
-    - `level`: of confidence, between 0 and 1.
+    For a `logarithmic` parameter, which must stay above its lower limit, it is symmetric in the logarithm of the
+    distance from it. For others it is cut at the limits, which are infinite for none.
 
     **Raises:**
 

@@ -339,13 +339,7 @@ def _alike(estimate: ParameterEstimate) -> list[tuple[str, str, float]]:
 
 
 def _read_fields(path: str | PathLike[str], wanted: list[str]) -> dict[str, Any]:
-    """The saved fields of a result by name.
-
-    **Raises:**
-
-    - `ValueError` for a damaged or a different file.
-    - `OSError` if there is none.
-    """
+    """The saved fields of a result by name, with the errors of `FitResult.load`."""
     content = io.BytesIO(Path(path).read_bytes())
     try:
         with zipfile.ZipFile(content) as archive:
