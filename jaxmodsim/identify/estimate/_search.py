@@ -170,6 +170,11 @@ def step(problem: FitProblem, state: SearchState, rtol: Array) -> SearchState:
     return levenberg_marquardt_step(problem.evaluate, problem.loss, problem.box, state, rtol)
 
 
+def state_at(problem: FitProblem, x: Float[Array, " n"]) -> SearchState:
+    """Residual, Jacobian and cost at `x`, by the compiled program of a search, whose first step only evaluates x."""
+    return step(problem, start_search(x, problem.rows), on_device(np.asarray(SearchOptions.rtol, x.dtype)))
+
+
 @eqx.filter_jit
 def steps_side_by_side(problem: FitProblem, axes: PyTree[int | None], states: SearchState, rtol: Array) -> SearchState:
     """One iteration of a batch of searches; `axes`: which numbers of the problem have a leading axis."""

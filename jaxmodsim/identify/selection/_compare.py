@@ -330,7 +330,7 @@ def _evaluated(
         return _parts(search.problem, search.state, block), ()
     shown = _finished(begin(fixed, x, options)).state.x
     best = _finished(solve(fixed, shown, options)).state.x
-    held, fitted = (_parts(*after(fixed, each, options), block) for each in (shown, best))
+    held, fitted = (_parts(*after(fixed, each), block) for each in (shown, best))
     return held, fitted
 
 

@@ -17,7 +17,7 @@ from ..data._record import Record, Runs, cut, runs_of
 from ..data._signals import sample_noise
 from ..estimate._prepare import measured_start
 from ..estimate._problem import FitProblem, Prior, SquaredLoss
-from ..estimate._search import SearchOptions, SearchResult, SearchState, channels_seen, solve, start_search, step
+from ..estimate._search import SearchOptions, SearchResult, SearchState, channels_seen, solve, state_at
 from ..model._engines import DELAY, EventEngine, ReplayEngine
 from ..model._parameters import FreeParameters
 from ..uncertainty._result import FitResult
@@ -99,11 +99,10 @@ def start_errors_of(jacobian: Float[np.ndarray, "rows local"]) -> Float[np.ndarr
     return np.where(size > 0, error / np.where(size > 0, size, 1.0), np.inf)
 
 
-def after(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> tuple[FitProblem, SearchState]:
+def after(problem: FitProblem, x: Float[Array, " n"]) -> tuple[FitProblem, SearchState]:
     """The problem without the opening, and its residual at `x`."""
     rest = problem.counting(~opening(problem.runs))
-    # The first step of a search only evaluates x.
-    return rest, step(rest, start_search(x, rest.rows), on_device(np.asarray(options.rtol, x.dtype)))
+    return rest, state_at(rest, x)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy import special  # scipy.stats takes most of a second to import
@@ -13,7 +12,7 @@ from scipy import special  # scipy.stats takes most of a second to import
 from ..._core.arguments import as_share
 from ..data._record import Record
 from ..data._signals import sample_noise
-from ..estimate._search import SearchOptions, SearchResult, channels_seen, start_search, step
+from ..estimate._search import SearchResult, channels_seen, state_at
 from ..model._engines import DELAY, with_values
 from ..uncertainty._result import FitResult
 from ._agreement import VARIATION, RecordAgreement, change_between, covariances, mean_variances, output_changes
@@ -241,9 +240,7 @@ def _start(
     rows = len(channels) * shown.size
     if not shown.any():
         return np.zeros((rows, 0)), np.zeros((0, rows)), np.zeros(rows)
-    # The first step of a search, which a score compiles anyway, only evaluates x.
-    state = step(run.problem, start_search(run.x, run.problem.rows), jnp.asarray(SearchOptions().rtol, run.x.dtype))
-    jacobian = np.asarray(state.jacobian)[: run.problem.samples]
+    jacobian = np.asarray(state_at(run.problem, run.x).jacobian)[: run.problem.samples]
     back = np.linalg.pinv(np.where(np.tile(shown, len(channels))[:, None], jacobian, 0.0), rcond=1e-10)
     levels = [
         max(sample_noise(score.record.channels[name]), rms(score.residuals[name][shown])) / float(noise[name])

@@ -14,7 +14,7 @@ from ..._core.arguments import as_share
 from ..._core.arrays import on_device
 from ..data._record import Record
 from ..estimate._problem import FitProblem
-from ..estimate._search import SearchState, start_search, step, weighted_by
+from ..estimate._search import SearchState, state_at, weighted_by
 from ..model._observe import RecordedMotion, motion_of
 
 # Blocks of samples: enough for the scatter of the scores of a dozen parameters, each much longer than the correlation
@@ -428,10 +428,8 @@ def derivatives_hold(problem: FitProblem, state: SearchState) -> bool:
     farthest = float(np.finfo(x.dtype).eps) ** (1 / 3)
     move = np.sum(axes * np.minimum(1.0, farthest / np.maximum(np.max(np.abs(axes), axis=0), _TINY)), axis=1)
     inside = np.clip(move, np.asarray(box.lower) - x, np.asarray(box.upper) - x)
-    trial = (x + inside).astype(x.dtype)
-    # The first step of a search only evaluates x, by the compiled program of the fit.
-    trial_state = step(problem, start_search(on_device(trial), problem.rows), on_device(np.asarray(0.0, x.dtype)))
-    missed = np.linalg.norm(np.asarray(trial_state.residual) - residual - jacobian @ inside)
+    there = np.asarray(state_at(problem, on_device((x + inside).astype(x.dtype))).residual)
+    missed = np.linalg.norm(there - residual - jacobian @ inside)
     return bool(missed < _HOLDS * np.linalg.norm(jacobian @ move))
 
 
