@@ -39,10 +39,12 @@ class AbstractLoss(eqx.Module):
     def rho(self, s: Float[Array, "..."]) -> Float[Array, "..."]:
         """The loss where the square of the residual is `s`."""
 
+    @eqx.filter_jit
     def cost(self, residual: Float[Array, " m"]) -> Float[Array, ""]:
         """Half the sum of the losses."""
         return 0.5 * jnp.sum(self.rho(residual**2))
 
+    @eqx.filter_jit
     def weighted(
         self, residual: Float[Array, " m"], jacobian: Float[Array, "m n"]
     ) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:

@@ -237,22 +237,11 @@ def channels_seen(problem: FitProblem, x: Float[Array, " n"]) -> dict[str, Float
     return problem.seen(x).channels
 
 
-@eqx.filter_jit
-def cost_of(loss: AbstractLoss, residual: Float[Array, " m"]) -> Float[Array, ""]:
-    """Half the sum of the losses of a residual."""
-    return loss.cost(residual)
-
-
 def weighted_by(loss: AbstractLoss, state: SearchState) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
     """Residual and Jacobian of a search, weighted as `AbstractLoss.weighted` says."""
     pair = state.residual, state.jacobian
-    residual, jacobian = _weighted(loss, *pair) if loss.robust else pair
+    residual, jacobian = loss.weighted(*pair) if loss.robust else pair
     return np.asarray(residual), np.asarray(jacobian)
-
-
-@eqx.filter_jit
-def _weighted(loss: AbstractLoss, residual: Array, jacobian: Array) -> tuple[Array, Array]:
-    return loss.weighted(residual, jacobian)
 
 
 def _rms(problem: FitProblem, state: SearchState) -> float:
@@ -325,5 +314,5 @@ def _rescaled(search: SearchResult, problem: FitProblem) -> SearchResult:
     factor = np.concatenate([factor, rest])
     residual = on_device(np.asarray(search.state.residual) * factor)
     jacobian = on_device(np.asarray(search.state.jacobian) * factor[:, None])
-    state = search.state._replace(residual=residual, jacobian=jacobian, cost=cost_of(old.loss, residual))
+    state = search.state._replace(residual=residual, jacobian=jacobian, cost=old.loss.cost(residual))
     return SearchResult(problem, state, search.iterations, search.ending)

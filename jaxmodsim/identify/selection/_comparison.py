@@ -11,7 +11,7 @@ from ..._core.arrays import on_device
 from ..._core.readable import AbstractReadable, Table, table_of
 from ..._core.system import jsonable
 from ..estimate._problem import AbstractLoss
-from ..estimate._search import SearchResult, cost_of, weighted_by
+from ..estimate._search import SearchResult, weighted_by
 from ..uncertainty._estimate import sample_blocks
 from ..uncertainty._residual_tests import effective_samples
 from ..uncertainty._result import FitResult
@@ -40,7 +40,7 @@ def deviance(search: SearchResult) -> float:
     problem = search.problem
     counts = {name: int(np.sum(np.asarray(weight) > 0)) for name, weight in problem.columns.items()}
     levels = sum(count * 2 * float(np.log(float(problem.noise[name]))) for name, count in counts.items())
-    return levels + 2 * float(cost_of(problem.loss, on_device(np.asarray(search.state.residual)[: problem.samples])))
+    return levels + 2 * float(problem.loss.cost(on_device(np.asarray(search.state.residual)[: problem.samples])))
 
 
 def penalty(search: SearchResult) -> float:

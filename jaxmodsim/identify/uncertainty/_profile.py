@@ -12,7 +12,7 @@ from scipy import special  # scipy.stats takes most of a second to import
 from ..._core.arguments import as_share, as_whole
 from ..._core.arrays import on_device
 from ..estimate._problem import FitProblem, Prior
-from ..estimate._search import SearchOptions, SearchResult, cost_of, start_search, step, weighted_by
+from ..estimate._search import SearchOptions, SearchResult, start_search, step, weighted_by
 from ._estimate import BLOCKS, ROUNDING, ParameterEstimate, floored_inverse
 from ._fit import searched_on
 from ._result import FitResult
@@ -132,7 +132,7 @@ class _Line:
         """Cost without the row that holds the parameter, and with its prior."""
         rows = np.array(residual)
         rows[self.problem.samples + self.index] = self.known[1] * (value - self.known[0])
-        return float(cost_of(self.problem.loss, on_device(rows)))
+        return float(self.problem.loss.cost(on_device(rows)))
 
     def refit(self, u: float, guess: np.ndarray) -> _Point | None:
         """The best fit with the parameter at u; None if the model is not finite."""
