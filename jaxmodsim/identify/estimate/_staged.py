@@ -1,6 +1,6 @@
 """Start values without a guess: from dimensions, from the balance of forces in slip, from reversals."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import equinox as eqx
@@ -161,11 +161,11 @@ def _settled(law: AbstractLaw, v: Array) -> Array:
     raise ValueError(f"Staged() does not know the force of {type(law).__name__} in steady slip; pass start values.")
 
 
-def _friction(problem: FitProblem, values: Mapping[str, ArrayLike]) -> Callable[[_Sampled], Array]:
-    """Generalised friction force at a sample, in steady slip."""
+def _friction(problem: FitProblem, sampled: _Sampled, values: Mapping[str, ArrayLike]) -> Float[Array, " samples"]:
+    """Generalised friction force in steady slip."""
     scene = with_values(problem.engine.model, values)
     if isinstance(scene, AbstractLaw):
-        return lambda s: _settled(scene.bind_state(s.t, s.q[None], s.v[None], s.inputs), s.v)
+        return jax.vmap(lambda s: _settled(scene.bind_state(s.t, s.q[None], s.v[None], s.inputs), s.v))(sampled)
     elements = list(scene.friction.values())
 
     def friction(s: _Sampled) -> Array:
@@ -178,22 +178,21 @@ def _friction(problem: FitProblem, values: Mapping[str, ArrayLike]) -> Callable[
             total = total - settled.apply_force(q, force if load is None else load * force, here.params)[0]
         return total
 
-    return friction
+    return jax.vmap(friction)(sampled)
 
 
-def _slip(problem: FitProblem) -> Callable[[_Sampled], Array]:
-    """The smallest slip speed of the friction elements at a sample: all must slip in the balance of forces."""
+def _slip(problem: FitProblem, sampled: _Sampled) -> Float[Array, " samples"]:
+    """The smallest slip speed of the friction elements: all must slip in the balance of forces."""
     scene = problem.engine.model
-    if isinstance(scene, AbstractLaw):
-        return lambda s: jnp.abs(s.v)
+    if isinstance(scene, AbstractLaw) or not scene.friction:
+        return jnp.abs(sampled.v)
     elements = list(scene.friction.values())
 
     def slip(s: _Sampled) -> Array:
         here = driven(scene, s.inputs)
-        speeds = [jnp.abs(each.slip(s.t, s.q[None], s.v[None], here.params)) for each in elements]
-        return jnp.min(jnp.stack(speeds)) if speeds else s.v
+        return jnp.min(jnp.stack([jnp.abs(x.slip(s.t, s.q[None], s.v[None], here.params)) for x in elements]))
 
-    return slip
+    return jax.vmap(slip)(sampled)
 
 
 def _fit_balance(
@@ -216,12 +215,12 @@ def _fit_balance(
 
 @eqx.filter_jit
 def _balance_step(problem: FitProblem, sampled: _Sampled, state: SearchState, rtol: Array) -> SearchState:
-    slip = jnp.abs(jax.vmap(_slip(problem))(sampled))
+    slip = _slip(problem, sampled)
     steady = (slip > _STEADY * jnp.max(slip)).astype(slip.dtype)
 
     def residual(x: Array) -> Array:
         values = problem.free.values(x)
-        return steady * (jax.vmap(_friction(problem, values))(sampled) - _required(problem, sampled, values))
+        return steady * (_friction(problem, sampled, values) - _required(problem, sampled, values))
 
     lower, upper = problem.free.bounds
     box = Box(lower, upper, problem.free.longest)
