@@ -392,19 +392,18 @@ def offsets_left(
         wide = np.column_stack([column, scaled])
         step = -np.linalg.lstsq(wide, residual, rcond=_NO_PART)[0]
         offset, left = float(step[0]), residual + wide @ step
-        variance = covariance_estimate(
+        estimate = covariance_estimate(
             left[:rows], wide[:rows], wide[rows:], np.eye(wide.shape[1]), numbers, count, 1, False
-        ).covariance[0, 0]
+        )
+        error = math.sqrt(estimate.covariance[0, 0])
         slopes = np.eye(len(x))
         slopes[: len(problem.free.names), : len(problem.free.names)] = problem.at(x).slopes
         moved = slopes @ (offset * taken / np.where(size > 0, size, 1.0))
         far = np.abs(moved[list(entries)]) > errors
-        if abs(offset) > _BEYOND * math.sqrt(variance) and far.any():
+        if abs(offset) > _BEYOND * error and far.any():
             # The model lacks the offset of the sensor.
-            offsets[channel] = (
-                offset * float(problem.noise[channel]),
-                math.sqrt(variance) * float(problem.noise[channel]),
-            )
+            level = float(problem.noise[channel])
+            offsets[channel] = offset * level, error * level
     return offsets
 
 
