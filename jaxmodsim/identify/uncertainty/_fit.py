@@ -174,7 +174,7 @@ def fit_scene(
     x, starts = run_initializers(initializers, prepared.problem.held, search_options)
     search = solve_freed(prepared.problem, x, search_options, prepared.known_noise)
     model = with_values(scene, search.problem.at(search.state.x).values)
-    return result_of(search, prepared.records, prepared.windows, prepared.units, model, step_error(search), starts)
+    return result_of(search, prepared.records, prepared.windows, prepared.units, model, starts)
 
 
 def fit_law(
@@ -260,7 +260,7 @@ def fit_law(
         name: allowed.unit + (per_load if allowed.unit.startswith("N") else "") for name, allowed in ranges.items()
     }
     fitted = with_values(law, search.problem.at(search.state.x).values)
-    return result_of(search, several, windows, units, fitted, None, starts)
+    return result_of(search, several, windows, units, fitted, starts)
 
 
 def _off_limits(numbers: dict[str, Array], ranges: dict[str, Range]) -> tuple[str, ...]:
@@ -280,7 +280,6 @@ def result_of(
     windows: Windows,
     units: dict[str, str],
     model: eqx.Module,
-    step_error: float | None = None,
     starts: tuple[float, ...] = (),
 ) -> FitResult:
     """The result of a search: estimate, diagnostics, provenance."""
@@ -328,7 +327,7 @@ def result_of(
         noise={name: float(x) for name, x in problem.noise.items()},
         ending=search.ending,
         evaluations=search.iterations,
-        step_error=step_error,
+        step_error=step_error(search),
         starts=starts,
         single_precision=jnp.result_type(float) == jnp.float32,
         issues=(
@@ -354,9 +353,8 @@ def searched_on(result: FitResult, x: Float[Array, " n"], options: SearchOptions
     ending = continued(search.ending, times, where)
     search = replace(search, iterations=before.iterations + search.iterations, ending=ending)
     model = with_values(provenance.model, search.problem.at(search.state.x).values)
-    error = None if result.diagnostics.step_error is None else step_error(search)
     units, starts = result.estimate.units, result.diagnostics.starts
-    return result_of(search, provenance.records, before.windows, units, model, error, starts)
+    return result_of(search, provenance.records, before.windows, units, model, starts)
 
 
 def _issues(
