@@ -132,16 +132,17 @@ def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str
         raise ValueError(f"{driven[0]} is driven by the record and cannot be free.")
     parameters = FreeParameters.of(single, ranges, chosen, _passive(options.passive, numbers))
     windows = cut(several, None if options.shooting is None else options.shooting.window)
+    runs = runs_of(several, windows)
     base = _bases(scene, several, windows, states, observables)
-    engine = _engine(scene, several, options, observables, states.q.shape[1])
-    names = (*dict(observables), *(slip_channel(x) for x in dict.fromkeys(e for r in several for e in r.slips)))
+    engine = _engine(scene, options, observables, several[0].linear, tuple(runs.slips), states.q.shape[1])
+    names = (*runs.measured, *map(slip_channel, runs.slips))
     noise = {name: on_device(noise_level(name, several)) for name in names}
     problem = FitProblem(
         engine,
         parameters,
         (*local, *unknown),
         base,
-        runs_of(several, windows),
+        runs,
         noise,
         options.loss,
         Prior.of(options.prior, parameters.names),
@@ -337,14 +338,13 @@ def _bases(
 
 def _engine(
     scene: Scene,
-    records: tuple[Record, ...],
     options: FitOptions,
     observables: Observables,
+    linear: frozenset[str],
+    slips: tuple[str, ...],
     dof: int,
 ) -> ReplayEngine | EventEngine:
-    linear = records[0].linear
     delays = {DELAY + name: on_device(float(late)) for name, late in options.delay.items()}
-    slips = tuple(dict.fromkeys(effect for record in records for effect in record.slips))
     fixed_steps = not scene.mode_names or (not scene.constraints and set(scene.mode_widths(dof)) == {1})
     if fixed_steps and not slips:
         return ReplayEngine(scene, delays, options.controller, observables, linear, options.substeps)
