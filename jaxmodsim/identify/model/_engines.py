@@ -92,7 +92,6 @@ def settle(t: Array, y: State, scene: Scene, mode: Array) -> tuple[State, Float[
 
 
 def pass_modes(
-    tableau: RosenbrockTableau,
     scene_at: Callable[[Array], Scene],
     t: Float[Array, ""],
     dt: Float[Array, ""],
@@ -107,7 +106,6 @@ def pass_modes(
 
     **Arguments:**
 
-    - `tableau`: the method.
     - `scene_at`: the scene with its inputs at a time.
     - `t`, `dt`: start and length of the step [s].
     - `y`, `mode`: consistent at `t`.
@@ -123,7 +121,7 @@ def pass_modes(
 
         whole = at.trial >= at.left
         length = jnp.where(whole, at.left, at.trial)
-        y1 = rosenbrock_step(tableau, field, at.t, length, at.y, pivot=True).y1
+        y1 = rosenbrock_step(RODAS3, field, at.t, length, at.y, pivot=True).y1
         t1 = at.t + length
         slope = field(t1, y1)
         guards, falls = jax.jvp(lambda t, y: _guards(t, y, scene_at(t), at.mode), (t1, y1), (jnp.ones_like(t1), slope))
@@ -233,7 +231,7 @@ def run_samples(
         def substep(k: int | Array, at: tuple[State, Array | None]) -> tuple[State, Array | None]:
             y, mode = at
             if mode is not None:
-                return pass_modes(RODAS3, scene_at, start + k * step, step, y, mode)
+                return pass_modes(scene_at, start + k * step, step, y, mode)
             return rosenbrock_step(RODAS3, field, start + k * step, step, y, pivot=True).y1, None
 
         moved = substep(0, (y, mode)) if substeps == 1 else jax.lax.fori_loop(0, substeps, substep, (y, mode))
