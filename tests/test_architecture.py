@@ -26,7 +26,7 @@ APPLICATIONS = {
     "metrics": 650,
     "analysis": 2160,
     "orbits": 3200,
-    "identify": 9900,
+    "identify": 9754,
     "sweeps": 2150,
     "export": 2100,
     "control": 800,
