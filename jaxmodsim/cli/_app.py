@@ -199,9 +199,13 @@ def export(
     compilers here support.
     """
     _start(spec)
-    from ._export import run_export
+    from ..export import fmu
+    from ._output import show_paths
+    from ._spec import read_export_spec
 
-    run_export(spec, model)
+    scene, options = read_export_spec(spec)
+    model.parent.mkdir(parents=True, exist_ok=True)
+    show_paths([fmu(scene, path=model, **options)])
 
 
 @app.command()

@@ -1,4 +1,4 @@
-"""The SPEC of `jaxmodsim sweep`, `orbit` and `branch`: a TOML file, read into arguments of the library."""
+"""The SPEC of `jaxmodsim sweep`, `orbit`, `branch` and `export`: a TOML file, read into arguments of the library."""
 
 import math
 from collections.abc import Callable
@@ -263,10 +263,7 @@ def read_orbit_spec(path: Path) -> OrbitSpec:
     """
     name = path.name
     whole = _toml.read_table(_OrbitTables, _toml.read_toml(path), name)
-    scene = _toml.read_system(whole.scene, _toml.inner(name, "scene"), path.parent)
-    if not isinstance(scene, Scene):
-        raise ValueError(f"{_toml.inner(name, 'scene')}: object must be a Scene, but it is a function.")
-    where = _toml.inner(name, "orbit")
+    scene, where = _scene(whole.scene, path), _toml.inner(name, "orbit")
     options = _toml.read_table(_OrbitTable, whole.orbit, where).model_dump(exclude_none=True)
     guess, frequency = (options.pop("q0"), options.pop("qd0")), options.pop("frequency", None)
     if frequency is not None:
@@ -292,26 +289,22 @@ def read_orbit_spec(path: Path) -> OrbitSpec:
     return OrbitSpec(scene, guess, options, branch, from_rest)
 
 
-@dataclass(frozen=True)
-class ExportSpec:
-    """The arguments of `export.fmu`, read from a file; `start` is `(q0, qd0)`."""
-
-    scene: Scene
-    start: tuple[list[float], list[float]]
-    options: dict[str, Any]
-
-
-def read_export_spec(path: Path) -> ExportSpec:
-    """Read the SPEC of an FMU.
+def read_export_spec(path: Path) -> tuple[Scene, dict[str, Any]]:
+    """Read the SPEC of an FMU: the scene, and the other arguments of `export.fmu`, by name.
 
     **Raises:**
 
     - `ValueError` for a mistake, as one sentence with the table and the key.
     """
     whole = _toml.read_table(_ExportTables, _toml.read_toml(path), path.name)
-    scene = _toml.read_system(whole.scene, _toml.inner(path.name, "scene"), path.parent)
-    if not isinstance(scene, Scene):
-        raise ValueError(f"{_toml.inner(path.name, 'scene')}: object must be a Scene, but it is a function.")
+    scene = _scene(whole.scene, path)
     table = _toml.read_table(_ExportTable, whole.export, _toml.inner(path.name, "export"))
-    options = table.model_dump(exclude_none=True)
-    return ExportSpec(scene, (options.pop("q0"), options.pop("qd0")), options)
+    return scene, table.model_dump(exclude_none=True)
+
+
+def _scene(content: dict[str, object], path: Path) -> Scene:
+    where = _toml.inner(path.name, "scene")
+    scene = _toml.read_system(content, where, path.parent)
+    if not isinstance(scene, Scene):
+        raise ValueError(f"{where}: object must be a Scene, but it is a function.")
+    return scene
