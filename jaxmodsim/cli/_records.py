@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from scipy.integrate import cumulative_trapezoid
 
 from .._core.arguments import axis_unit, nearest
 from ..identify import Record, clock_offset, sampling_gaps, unexplained_force
@@ -121,7 +122,7 @@ def _parts_of(table: Columns, columns: AxisColumns, name: str) -> tuple[tuple[Re
     t, position, force = arrays["time"], arrays["position"], arrays["force"]
     notes += dropped
     if units["position"].velocity:
-        position = _integral(t, position)
+        position = cumulative_trapezoid(position, t, initial=0.0)
         notes.append(
             f"column {headers['position']!r} is a velocity; its integral is fitted as the position, which accumulates"
             " the noise of the velocity."
@@ -282,16 +283,12 @@ def _parts(record: Record) -> tuple[tuple[Record, ...], list[str]]:
     ]
 
 
-def _integral(t: np.ndarray, v: np.ndarray) -> np.ndarray:
-    return np.concatenate([[0.0], np.cumsum(0.5 * np.diff(t) * (v[1:] + v[:-1]))])
-
-
 def _doubts(record: Record, headers: Mapping[str, str], units: Mapping[str, Unit], rotary: bool | None) -> list[str]:
     """Sentences on unstated units that are probably wrong."""
     unit, sentences, doubts = axis_unit("m", bool(rotary)), [], []
     if not units["position"].text:
         left = unexplained_force(record)
-        as_velocity = Record(record.t, _integral(record.t, record.measured), record.inputs)
+        as_velocity = Record(record.t, cumulative_trapezoid(record.measured, record.t, initial=0.0), record.inputs)
         if left > _UNEXPLAINED and unexplained_force(as_velocity) < _BETTER * left:
             sentences.append(
                 f"the force depends on {headers['position']!r} as on a velocity, not as on a position."
