@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Iterable
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, Field, dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -27,9 +27,8 @@ def command_of(record: type[Options]) -> Callable[[Callable[[Options], None]], C
         # Its own first, as --help lists them.
         every = fields(record)  # pyright: ignore[reportArgumentType] # a dataclass
         for each in sorted(every, key=lambda each: each.name not in record.__annotations__):
-            default = each.default if each.default_factory is MISSING else each.default_factory()
+            default, kind = _default_of(each), inspect.Parameter.KEYWORD_ONLY
             default = inspect.Parameter.empty if default is MISSING else default
-            kind = inspect.Parameter.KEYWORD_ONLY
             parameters.append(inspect.Parameter(each.name, kind, default=default, annotation=each.type))
         command.__signature__ = inspect.Signature(parameters)  # pyright: ignore[reportFunctionMemberAccess]
         command.__name__, command.__doc__ = function.__name__, function.__doc__
@@ -38,8 +37,12 @@ def command_of(record: type[Options]) -> Callable[[Callable[[Options], None]], C
     return command_for
 
 
-def _option(panel: str | None, text: str, metavar: str | None = None, flag: str | None = None) -> OptionInfo:
-    return typer.Option(*([flag] if flag else []), help=text, metavar=metavar, rich_help_panel=panel)
+def _default_of(option: Field[Any]) -> Any:
+    return option.default if option.default_factory is MISSING else option.default_factory()
+
+
+def _option(panel: str | None, text: str, metavar: str | None = None) -> OptionInfo:
+    return typer.Option(help=text, metavar=metavar, rich_help_panel=panel)
 
 
 Out = Annotated[Path, typer.Option(help="Folder for figures, tables and JSON; created if missing.")]
@@ -256,11 +259,8 @@ def check_axis(request: FitRequest) -> None:
     if request.axis not in ("driven", "servo"):
         raise ValueError(f"--axis must be driven or servo, but {request.axis!r} was given.")
     for each in fields(request):
-        default = each.default if each.default_factory is MISSING else each.default_factory()
-        if (
-            each.name in ("records", "time", "position", "laws", "out", "axis")
-            or getattr(request, each.name) == default
-        ):
+        of_both = each.name in ("records", "time", "position", "laws", "out", "axis")
+        if of_both or getattr(request, each.name) == _default_of(each):
             continue
         option = each.type.__metadata__[0]  # pyright: ignore[reportAttributeAccessIssue] # an Annotated
         if (option.rich_help_panel == _SERVO) != (request.axis == "servo"):
@@ -305,4 +305,4 @@ class SweepRequest:
         int | None, typer.Option(help="Processes of a local Dask cluster; by default threads of this process.", min=1)
     ] = None
     scheduler: Annotated[str | None, _option(None, "Address of a running Dask scheduler.", "ADDRESS")] = None
-    dry_run: Annotated[bool, _option(None, "Print the plan of the sweep and run nothing.", flag="--dry-run")] = False
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan of the sweep and run nothing.")] = False
