@@ -2,7 +2,7 @@
 
 import math
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -99,7 +99,8 @@ def plan_of(request: FitRequest) -> FitPlan:
         name: [x for x in scene_numbers(axis_scene(model, axis)) if x != "u" and not x.endswith("belt_velocity")]
         for name, model in models.items()
     }
-    start, fixed = _values("--start", request.start, numbers), _values("--fix", request.fix, numbers)
+    known = dict.fromkeys(name for own in numbers.values() for name in own)
+    start, fixed = _values("--start", request.start, known), _values("--fix", request.fix, known)
     chosen = [name for name in listed(request.free) if not name.startswith("+")]
     added = [name.removeprefix("+") for name in listed(request.free) if name.startswith("+")]
     for name in (*chosen, *added):
@@ -118,7 +119,7 @@ def plan_of(request: FitRequest) -> FitPlan:
         folds=request.folds,
         records=records,
         held_out=held_out,
-        limits={"m": (0.0, None)} | _limits(request.limit, numbers),
+        limits={"m": (0.0, None)} | _limits(request.limit, known),
         options=options,
         substeps=request.substeps,
         rotary=any(file.rotary for file in files),
@@ -174,23 +175,19 @@ def known_name(option: str, name: str, known: Iterable[str], noun: str = "name",
     )
 
 
-def _known_of_any(option: str, name: str, numbers: Mapping[str, Sequence[str]]) -> str:
-    return known_name(option, name, dict.fromkeys(x for own in numbers.values() for x in own), "parameter")
-
-
-def _values(option: str, texts: Sequence[str], numbers: Mapping[str, Sequence[str]]) -> dict[str, float]:
-    """Parse NAME=VALUE; at least one of the models must have the name."""
+def _values(option: str, texts: Sequence[str], known: Iterable[str]) -> dict[str, float]:
+    """Parse NAME=VALUE."""
     values: dict[str, float] = {}
     for text in texts:
         name, equals, number = text.partition("=")
         value = number_of(number)
         if not equals or value is None:
             raise ValueError(f"{option} needs NAME=VALUE with a number, but {text!r} was given.")
-        values[_known_of_any(option, name, numbers)] = value
+        values[known_name(option, name, known, "parameter")] = value
     return values
 
 
-def _limits(texts: Sequence[str], numbers: Mapping[str, Sequence[str]]) -> Limits:
+def _limits(texts: Sequence[str], known: Iterable[str]) -> Limits:
     """Parse NAME=LOW:HIGH, where either side may be omitted."""
     limits: Limits = {}
     for text in texts:
@@ -204,7 +201,8 @@ def _limits(texts: Sequence[str], numbers: Mapping[str, Sequence[str]]) -> Limit
             )
         if least is not None and most is not None and not least < most:
             raise ValueError(f"--limit {text}: the lower limit must be below the upper one.")
-        limits[_known_of_any("--limit", name, numbers)] = (0.0 if name == "m" and least is None else least, most)
+        known_name("--limit", name, known, "parameter")
+        limits[name] = (0.0 if name == "m" and least is None else least, most)
     return limits
 
 
