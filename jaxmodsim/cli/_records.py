@@ -266,11 +266,9 @@ def _checked(
 def _parts(record: Record) -> tuple[tuple[Record, ...], list[str]]:
     """The record, cut at gaps in the samples, where the force is unknown."""
     gaps = sampling_gaps(record)
-    if not gaps:
-        return (record,), []
     edges = [0, *(last + 1 for last in gaps), len(record.t)]
     spans = [(a, b) for a, b in pairwise(edges) if b - a >= _LEAST_PART]
-    if not spans:
+    if not gaps or not spans:
         return (record,), []
     parts = tuple(record.samples(a, b, f"{record.name} part {i + 1}") for i, (a, b) in enumerate(spans))
     where = ", ".join(f"from {record.t[k]:g} to {record.t[k + 1]:g} s" for k in gaps[:_NAMED])
