@@ -15,7 +15,6 @@ from .._core.progress import candidate_words, iteration_words, progress_line
 from ..analysis import formulations
 from ..identify import (
     AxisLimits,
-    Comparison,
     FitResult,
     InputDesign,
     Profile,
@@ -99,16 +98,18 @@ def _fitted(plan: FitPlan, substeps: int) -> FitOutcome:
 
     A model is fitted alone in the same way as among others, so that its numbers are the same.
     """
+    options = {**plan.options, "substeps": substeps}
     if plan.compared:
-        comparison = _compared(plan, substeps)
+        validation: dict[str, Any] = {"hold_out": plan.held_out} if plan.folds is None else {"folds": plan.folds}
+        with _progress("compare", candidate_words) as report:
+            comparison = compare(plan.candidates, plan.records, progress=report, **validation, **options)
         model = comparison.simplest
         return FitOutcome(plan, model, with_units(comparison.results[model], plan.rotary), comparison)
     ((model, candidate),) = plan.candidates.items()
     scene, free = candidate.scene, candidate.free
     assert isinstance(scene, Scene)
     assert free is not None
-    result = fit_with_progress(scene, plan.records, free, limits=plan.limits, substeps=substeps, **plan.options)
-    return FitOutcome(plan, model, with_units(result, plan.rotary))
+    return FitOutcome(plan, model, with_units(fit_with_progress(scene, plan.records, free, **options), plan.rotary))
 
 
 def _validated(outcome: FitOutcome) -> FitOutcome:
@@ -145,13 +146,6 @@ def _progress(title: str, text_of: Callable[..., str]) -> Iterator[Callable[...,
             yield report
         finally:
             signal.signal(signal.SIGINT, before)
-
-
-def _compared(plan: FitPlan, substeps: int) -> Comparison:
-    validation: dict[str, Any] = {"hold_out": plan.held_out} if plan.folds is None else {"folds": plan.folds}
-    options = {**validation, **plan.options, "substeps": substeps}
-    with _progress("compare", candidate_words) as report:
-        return compare(plan.candidates, plan.records, limits=plan.limits, progress=report, **options)
 
 
 def fit_with_progress(

@@ -42,7 +42,7 @@ class FitPlan:
     - `candidates`: models by name; a single one where nothing is compared.
     - `compared`: whether models are compared, or one is cross-validated. `folds`: how many; None for the default.
     - `records`, `held_out`: records to fit, and records for validation.
-    - `limits`: limits of parameters. `options`: further arguments of `fit`.
+    - `options`: further arguments of `fit`.
     - `substeps`: None to refine them. `rotary`: whether the axis is rotary. `notes`: sentences on reading the files.
     """
 
@@ -51,7 +51,6 @@ class FitPlan:
     folds: int | None
     records: tuple[Record, ...]
     held_out: tuple[Record, ...]
-    limits: Limits
     options: dict[str, Any]
     substeps: int | None
     rotary: bool
@@ -119,8 +118,7 @@ def plan_of(request: FitRequest) -> FitPlan:
         folds=request.folds,
         records=records,
         held_out=held_out,
-        limits={"m": (0.0, None)} | _limits(request.limit, known),
-        options=options,
+        options=options | {"limits": {"m": (0.0, None)} | _limits(request.limit, known)},
         substeps=request.substeps,
         rotary=any(file.rotary for file in files),
         notes=tuple(notes),
