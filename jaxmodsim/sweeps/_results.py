@@ -8,11 +8,11 @@ import json
 import os
 import shutil
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.tree_util as jtu
@@ -193,15 +193,23 @@ def _value(x: object) -> object:
 
 
 class AbstractResults(abc.ABC):
-    """Storage for the results of blocks, in any order."""
+    """Storage for the results of blocks, in any order; `_arrays` are the arrays of the variables by name."""
+
+    _layout: ResultLayout
+    _blocks: Blocks
+    _arrays: Any
 
     @abc.abstractmethod
     def done(self, block: int) -> np.ndarray | None:
         """Codes of the runs of a stored block; None for a block that is not computed yet."""
 
-    @abc.abstractmethod
     def write(self, block: int, computed: Computed) -> None:
-        """Store the results of a block."""
+        """Store the results of a block, one chunk of each variable, `result` last."""
+        place = self._blocks.place(block)
+        shape = tuple(along.stop - along.start for along in place)
+        values = {"num_steps": computed.num_steps, "result": computed.code} | computed.values
+        for variable in self._layout.variables:
+            self._arrays[variable.name][place] = values[variable.name].reshape(*shape, *variable.shape)
 
     @abc.abstractmethod
     def dataset(self) -> "xr.Dataset":
@@ -222,12 +230,6 @@ class Memory(AbstractResults):
     def done(self, block: int) -> np.ndarray | None:
         """None: no block is stored beforehand."""
         del block
-
-    def write(self, block: int, computed: Computed) -> None:
-        """Copy the results into the arrays."""
-        place = self._blocks.place(block)
-        for name, x in _parts(self._layout, self._blocks, block, computed):
-            self._arrays[name][place] = x
 
     def dataset(self) -> "xr.Dataset":
         """All results."""
@@ -266,12 +268,12 @@ class Store(AbstractResults):
                 partial.unlink(missing_ok=True)
         else:
             _create(path, layout, blocks, {**attrs, _ATTRIBUTE: json.dumps(provenance)})
-        self._group = extra("zarr").open_group(path, mode="r+")
+        self._arrays = extra("zarr").open_group(path, mode="r+")
 
     def done(self, block: int) -> np.ndarray | None:
         """Codes of a block whose last chunk is stored."""
         try:
-            codes = np.asarray(self._group["result"][self._blocks.place(block)])
+            codes = np.asarray(self._arrays["result"][self._blocks.place(block)])
         except (ValueError, RuntimeError) as error:
             raise ValueError(
                 f"{self._path} is damaged: chunk {block} of result cannot be read ({error}). Remove its file to"
@@ -279,26 +281,10 @@ class Store(AbstractResults):
             ) from error
         return None if (codes == NOT_RUN).any() else codes
 
-    def write(self, block: int, computed: Computed) -> None:
-        """Write one chunk of each variable."""
-        place = self._blocks.place(block)
-        for name, x in _parts(self._layout, self._blocks, block, computed):
-            self._group[name][place] = x
-
     def dataset(self) -> "xr.Dataset":
         """All results, read on access."""
         stored = extra("xarray").open_zarr(self._path, consolidated=False, chunks=None)
         return stored[[x.name for x in self._layout.variables]]  # a store has no order of variables
-
-
-def _parts(layout: ResultLayout, blocks: Blocks, block: int, computed: Computed) -> Iterator[tuple[str, np.ndarray]]:
-    """Results of a block by variable, in the shape of the block, `result` last."""
-    shape = tuple(place.stop - place.start for place in blocks.place(block))
-    for variable in layout.variables:
-        x = computed.values.get(variable.name)
-        if x is None:
-            x = computed.code if variable.name == "result" else computed.num_steps
-        yield variable.name, x.reshape(*shape, *variable.shape)
 
 
 def _check_same(path: Path, provenance: dict[str, object]) -> None:
