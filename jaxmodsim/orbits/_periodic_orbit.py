@@ -141,17 +141,13 @@ def prepare(
     relative, absolute = (
         jnp.asarray(as_float(x, name=name, lower=0.0), float) for name, x in (("rtol", rtol), ("atol", atol))
     )
-    empty = jnp.zeros(0)
     phase = jnp.zeros(())
     if isinstance(guess, PeriodicOrbit):
         phase = jax.lax.stop_gradient(guess.t0 / guess.period)
     number = (
         period if period is None or callable(period) else _ConstantPeriod(as_float(period, name="period", lower=0.0))
     )
-    none = jnp.zeros((0, 0))
-    problem = OrbitProblem(
-        *(scene, phase, relative, absolute, empty, empty, empty, number, section, parameters, none, none)
-    )
+    problem = OrbitProblem(scene, phase, relative, absolute, number, section, parameters)
     count = as_whole(segments, name="segments")
     state = _state(scene, guess)
     dof = state.q.shape[-1]
@@ -318,18 +314,12 @@ def _refuse_family(problem: OrbitProblem, point: ShotOrbit, scale: np.ndarray, d
     period = point.period + (away[size] if problem.autonomous else 0.0)
     beside = evaluate(problem, point.x + away[:size].reshape(point.x.shape), period, point.values, dof)
     # At a fold this residual would be of second order, 1e-6.
-    if not beside.failure and _miss(beside, scale) < 1e-8:
+    if not beside.failure and np.max(np.abs(beside.residual[:size]) / scale[:size]) < 1e-8:
         raise OrbitError(
             "The orbit is one of a family: it has another multiplier of exactly 1, and the scene does not determine"
             " which orbit. Examples are conservative scenes, a bristle that never slips, and dry friction at certain"
             " frequencies. Add a little damping, or change the frequency."
         )
-
-
-def _miss(point: ShotOrbit, scale: np.ndarray) -> float:
-    """Largest residual of the states, in the scales."""
-    size = point.x.size
-    return float(np.max(np.abs(point.residual[:size]) / scale[:size]))
 
 
 def _with_derivatives(

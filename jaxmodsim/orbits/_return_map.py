@@ -41,20 +41,22 @@ class OrbitProblem(eqx.Module):
       advance. `pinned`: projector on these and on the directions in which elements stick throughout; in all of them
       the orbit begins at `anchor`. Shape `[n, n]` each.
     - `held`: names of the friction elements that stick throughout.
+
+    `anchored` sets plane, segments, projectors and `held`, which are empty before.
     """
 
     scene: Scene
     phase: Float[Array, ""]
     rtol: Float[Array, ""]
     atol: Float[Array, ""]
-    normal: Float[Array, " n"]
-    anchor: Float[Array, " n"]
-    cuts: Float[Array, " segments"]
     period: PeriodFn | None = eqx.field(static=True)
     section: Section | None = eqx.field(static=True)
     parameters: tuple[str, ...] = eqx.field(static=True)
-    free: Float[Array, "n n"]
-    pinned: Float[Array, "n n"]
+    normal: Float[Array, " n"] = eqx.field(default_factory=lambda: jnp.zeros(0))
+    anchor: Float[Array, " n"] = eqx.field(default_factory=lambda: jnp.zeros(0))
+    cuts: Float[Array, " segments"] = eqx.field(default_factory=lambda: jnp.zeros(0))
+    free: Float[Array, "n n"] = eqx.field(default_factory=lambda: jnp.zeros((0, 0)))
+    pinned: Float[Array, "n n"] = eqx.field(default_factory=lambda: jnp.zeros((0, 0)))
     held: tuple[str, ...] = eqx.field(static=True, default=())
 
     @property

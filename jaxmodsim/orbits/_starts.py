@@ -95,9 +95,8 @@ def _at_hopf_point(
     """A small orbit at a Hopf point, which begins on the real part of the eigenvector."""
     rest, dof = point.orbit, len(point.orbit.q)
     centre, (wave, extent), born = np.asarray(pack(rest.state)), _wave(scene, rest), rest.period
-    n, empty, (rtol, atol) = len(centre), jnp.zeros(0), map(jnp.asarray, tolerances)
-    none = jnp.zeros((0, 0))
-    problem = OrbitProblem(scene, jnp.zeros(()), rtol, atol, empty, empty, empty, None, None, (parameter,), none, none)
+    n, (rtol, atol) = len(centre), map(jnp.asarray, tolerances)
+    problem = OrbitProblem(scene, jnp.zeros(()), rtol, atol, None, None, (parameter,))
     along = wave / extent
     row = np.append(along / (along @ along), [0.0, 0.0])
     first: OrbitStep | None = None
