@@ -29,35 +29,28 @@ def measure(calls: dict[str, Callable[[], object]], rounds: int, limit_s: float 
     """
     report: dict[str, dict[str, PyTree]] = {}
     seconds: dict[str, list[float]] = {}
+    slow: dict[str, bool] = {}
     for name, call in calls.items():
         try:
-            first = _seconds(call)
-            second = _seconds(call)
+            first, second = _seconds(call), _seconds(call)
         except Exception as error:  # a failure is a result, too
             report[name] = {"failed": f"{type(error).__name__}: {str(error).strip().splitlines()[0][:400]}"}
             continue
-        report[name] = {"first_s": first, "slow": second > _SLOW}
-        seconds[name] = []
+        report[name], seconds[name], slow[name] = {"first_s": first}, [], second > _SLOW
     gc.collect()
     gc.disable()
     try:
         for _ in range(rounds):
             for name, taken in seconds.items():
                 if sum(taken) < limit_s:
-                    taken += _turn(calls[name], report[name]["slow"])
+                    if not slow[name]:
+                        calls[name]()
+                    taken += [_seconds(calls[name]) for _ in range(1 if slow[name] else _BURST)]
     finally:
         gc.enable()
     for name, taken in seconds.items():
-        del report[name]["slow"]
         report[name] |= _summary(taken)
     return report
-
-
-def _turn(call: Callable[[], object], slow: bool) -> list[float]:
-    if slow:
-        return [_seconds(call)]
-    call()
-    return [_seconds(call) for _ in range(_BURST)]
 
 
 def _seconds(call: Callable[[], object]) -> float:
