@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from ..analysis import Row, WorkPrecision
-from ._style import COLOURS, GREY, RED, Figure, panel_letters, plain_ticks, with_unit
+from ._style import COLOURS, GREY, RED, Figure, panel_letters, plain_ticks
 
 _MARKERS = "osD^vPX*"
 _LABELS = {
@@ -59,8 +59,9 @@ def work_precision_figure(study: WorkPrecision, *, cost: str = "run") -> Figure:
         handles.append(left.errorbar(errors, median, yerr=bars, capsize=2.0, elinewidth=0.8, **style, label=label))
         right.plot(errors, [row.evaluations if counted else row.steps for row in rows], **style)
         _mark_model(left, right, rows, COLOURS[i % len(COLOURS)])
+    scale = f"{study.scale:.3g} {study.unit}".rstrip()
     for axes in (left, right):
-        axes.set(xscale="log", yscale="log", xlabel=f"error of {study.observable}, relative to {_scale(study)} [1]")
+        axes.set(xscale="log", yscale="log", xlabel=f"error of {study.observable}, relative to {scale} [1]")
         axes.grid(which="major", alpha=0.3)
         _mark_floor(axes, study.disagreement)
     left.set(ylabel=_LABELS[cost].format(batch=study.batch), title="Time: lower left is better")
@@ -80,10 +81,6 @@ def _failures(study: WorkPrecision) -> list[str]:
     """A line for each failure, shortened to the width of the figure."""
     lines = [f"failed: {row.method}, {row.setting}: {row.failed}" for row in study.rows if row.failed]
     return [line if len(line) <= 170 else f"{line[:167]}..." for line in lines]
-
-
-def _scale(study: WorkPrecision) -> str:
-    return with_unit(f"{study.scale:.3g}", study.unit).replace("[", "").replace("]", "")
 
 
 def _shown(row: Row, study: WorkPrecision) -> float:
