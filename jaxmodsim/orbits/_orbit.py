@@ -222,7 +222,7 @@ def describe(problem: OrbitProblem, point: ShotOrbit, dof: int) -> tuple[Periodi
         problem.autonomous,
         missed,
         tuple(runs),
-        tuple(change for each in once for change in _sequence(each)),
+        tuple((change.effect, change.before, change.after) for each in once for change in each.mode_changes),
         shares,
         jnp.asarray(point.advance[:dof]),
         neutral,
@@ -240,10 +240,6 @@ def _changes(run: Trajectory) -> list[tuple[float, int, int, int]]:
     events = run.events
     columns = (np.asarray(x).tolist() for x in (events.t, events.effect, events.before, events.after))
     return [x for x in zip(*columns, strict=True) if x[0] < np.inf]
-
-
-def _sequence(run: Trajectory) -> ModeSequence:
-    return tuple((x.effect, x.before, x.after) for x in run.mode_changes)
 
 
 def _shares(
