@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
+from .._core.arguments import as_whole
 from .._core.system import describe_machine
 from ..friction import AbstractSetValuedLaw, DeadZone, LuGre, Regularized
 from ..scene import Friction, Scene, elements
@@ -252,7 +253,8 @@ def work_precision(
     closed = _closed_form(reference, np.array([question.t1]) if ts is None else ts)
     methods = default_methods(scene) if methods is None else dict(methods)
     tolerances = [float(x) for x in tolerances]
-    _check(methods, tolerances, costs, batch, rounds)
+    _check(methods, tolerances, costs)
+    batch, rounds = as_whole(batch, name="batch"), as_whole(rounds, name="rounds")
     if {"forward", "reverse"} & set(costs) or wrt is not None:
         question = replace(question, values=chosen_numbers(scene, question.q0, question.qd0, wrt))
         costs = tuple(costs) if {"forward", "reverse"} & set(costs) else (*costs, "forward")
@@ -307,7 +309,7 @@ def _closed_form(
     return closed
 
 
-def _check(methods: dict[str, Method], tolerances: list[float], costs: Sequence[str], batch: int, rounds: int) -> None:
+def _check(methods: dict[str, Method], tolerances: list[float], costs: Sequence[str]) -> None:
     for name, method in methods.items():
         if not isinstance(method, Method):
             raise ValueError(
@@ -321,9 +323,6 @@ def _check(methods: dict[str, Method], tolerances: list[float], costs: Sequence[
         raise ValueError("tolerances is empty: pass some, or steps for every method.")
     if isinstance(costs, str) or "run" not in costs or not set(costs) <= set(COSTS):
         raise ValueError(f"costs must be 'run' and any of {', '.join(COSTS[1:])}, but {costs!r} was given.")
-    for name, number in (("batch", batch), ("rounds", rounds)):
-        if isinstance(number, bool) or not isinstance(number, int) or number < 1:
-            raise ValueError(f"{name} must be a positive integer, but {number!r} was given.")
 
 
 def _settings(method: Method, tolerances: Sequence[float]) -> list[dict[str, float]]:
