@@ -24,15 +24,15 @@ FILES = sorted(ROOT.rglob("*.py"))
 CORE = {"_core": 3285, "mechanics": 1610, "friction": 2993, "scene": 3800, "solvers": 4045, "simulation": 3192}
 APPLICATIONS = {
     "metrics": 650,
-    "analysis": 2160,
-    "orbits": 3200,
+    "analysis": 2150,
+    "orbits": 3143,
     "identify": 9754,
-    "sweeps": 2150,
+    "sweeps": 2136,
     "export": 2100,
     "control": 800,
     "problems": 2900,
-    "plot": 1750,
-    "cli": 3450,
+    "plot": 1729,
+    "cli": 3399,
 }
 LABORATORY = ("tests", "bench")
 ROOMS = (*CORE, *APPLICATIONS)
