@@ -196,6 +196,40 @@ def test_an_event_within_rounding_of_the_start_fires_once() -> None:
     np.testing.assert_allclose(t * rate, y0, atol=10.0 * eps if cancels else 4.0 * stair)
 
 
+@pytest.mark.parametrize(("begin", "root", "stair"), [(100.0, 4e-6, 0.0)])
+def test_an_event_in_rounding_has_the_time_and_the_derivative_of_its_root(
+    begin: float, root: float, stair: float
+) -> None:
+    """Thresholds of a sine in float32; `root`: the value of the guards at events, `stair`: their rounding."""
+    real, eps = jnp.float32, float(jnp.finfo(jnp.float32).eps)
+
+    def thresholds(t: Any, s: Any, above: Any) -> Any:
+        values = jnp.stack([s.y[0] + 10.0, above - s.y[0]])
+        if stair:
+            values += jax.lax.stop_gradient(jnp.round(values / stair) * stair - values)
+        return values, jnp.zeros_like(values), jnp.full_like(values, root)
+
+    events = EventSolver(dfx.Tsit5(), thresholds, count, rtol=1e-5, dtmin=eps, max_events=4)
+
+    @jax.jit
+    @jax.vmap
+    def passage(above: Any) -> Any:
+        def time_of(above: Any) -> Any:
+            start = events.start(jnp.asarray(begin, real), jnp.array([0.0, 1.0], real), jnp.zeros(2, real), above)
+            field = dfx.ODETerm(lambda t, s, args: s.rate(jnp.stack([s.y[1], -s.y[0]])))
+            how: dict[str, Any] = {"stepsize_controller": EventController(dfx.PIDController(1e-5, 1e-7))}
+            how["adjoint"] = dfx.ForwardMode()
+            done: Any = dfx.diffeqsolve(field, events, real(begin), real(begin + 1.6), None, start, above, **how)
+            return done.ys.log.t[-1, 0]
+
+        return jax.jvp(time_of, (above,), (jnp.ones_like(above),))
+
+    above = np.linspace(0.05, 0.95, 512, dtype=np.float32)
+    (t, slope), exact = passage(jnp.asarray(above)), above.astype(float)
+    np.testing.assert_allclose(t, begin + np.arcsin(exact), rtol=4 * eps, atol=10 * max(root, stair))
+    np.testing.assert_allclose(slope, 1 / np.sqrt(1 - exact**2), rtol=1e-3)
+
+
 @pytest.mark.parametrize("name", ["Tsit5", "Rodas5P"])
 def test_a_step_to_infinity_is_repeated_with_a_shorter_one(name: str) -> None:
     """A body that falls on a wall of `exp(-k y)`; a step ends deep in the wall, where the force overflows."""

@@ -356,11 +356,12 @@ class EventSolver(AbstractSolverWrapper):
         near = landing(jnp.ones_like(length))
         if jumps is not None:  # an event before a jump is another event
             near = jnp.where(jumps, _constant(resolution), near)
-        near = near / divisor
+        comes = arrives(seen, end, root, resolution / divisor)  # from as far as an instant
+        near = jnp.where(comes, jnp.maximum(near, instant(resolution) / LATITUDE), near) / divisor
         # The cubic of a guard that has just fallen may be flat: within `root`, a rounding, it is at its root.
         here = (seen.armed & (jnp.abs(seen.ahead) <= near)) | (seen.crosses & (1.0 - seen.root <= near))
         here = here | ((end <= 0) & (end >= -root) & (seen.slopes(jnp.ones(()))[0] < 0))
-        here = self._policy.fires(here, seen, end, length, t1) | arrives(seen, end, root, resolution / divisor)
+        here = self._policy.fires(here, seen, end, length, t1) | comes
         # A guard whose root is at the start of a step fires if the step has the shortest length.
         here = here | (seen.crosses & (seen.root * length <= resolution) & (length <= shortest))
         passed = seen.crosses & ~here
@@ -372,9 +373,8 @@ class EventSolver(AbstractSolverWrapper):
         first = jnp.arange(fired.shape[0]) == jnp.argmin(jnp.where(fired, seen.ahead, jnp.inf))
         ahead = jnp.where(missed, first_root(seen, passed), 1.0 + jnp.maximum(sight, 0.0))
         coming = jnp.argmin(jnp.where(missed, jnp.where(passed, seen.root, jnp.inf), seen.ahead))
-        behind = landing(ahead)[coming]
         near = jnp.sum(jnp.where(first, near, 0.0))
-        next_end = self._policy.next_end(ahead, missed, (behind, divisor))
+        next_end = self._policy.next_end(ahead, missed, (landing(ahead)[coming], divisor))
         return Landing(fired, first, seen.ahead, missed, landed, landed, next_end, near)
 
     def _guard_rates(self, t: Array, state: EventState, slope: PyTree, args: PyTree) -> Float[Array, " guards"]:
