@@ -196,7 +196,7 @@ def test_an_event_within_rounding_of_the_start_fires_once() -> None:
     np.testing.assert_allclose(t * rate, y0, atol=10.0 * eps if cancels else 4.0 * stair)
 
 
-@pytest.mark.parametrize(("begin", "root", "stair"), [(100.0, 4e-6, 0.0)])
+@pytest.mark.parametrize(("begin", "root", "stair"), [(100.0, 4e-6, 0.0), (4.0, 0.0, 1e-6)])
 def test_an_event_in_rounding_has_the_time_and_the_derivative_of_its_root(
     begin: float, root: float, stair: float
 ) -> None:
@@ -207,9 +207,11 @@ def test_an_event_in_rounding_has_the_time_and_the_derivative_of_its_root(
         values = jnp.stack([s.y[0] + 10.0, above - s.y[0]])
         if stair:
             values += jax.lax.stop_gradient(jnp.round(values / stair) * stair - values)
-        return values, jnp.zeros_like(values), jnp.full_like(values, root)
+        return values, jnp.full_like(values, 4 * stair), jnp.full_like(values, root)
 
-    events = EventSolver(dfx.Tsit5(), thresholds, count, rtol=1e-5, dtmin=eps, max_events=4)
+    shortest = eps * (begin + 1.6)
+    events = EventSolver(dfx.Tsit5(), thresholds, count, rtol=1e-5, dtmin=shortest, max_events=4)
+    control = EventController(dfx.PIDController(1e-5, 1e-7, dtmin=shortest, force_dtmin=False))
 
     @jax.jit
     @jax.vmap
@@ -217,15 +219,17 @@ def test_an_event_in_rounding_has_the_time_and_the_derivative_of_its_root(
         def time_of(above: Any) -> Any:
             start = events.start(jnp.asarray(begin, real), jnp.array([0.0, 1.0], real), jnp.zeros(2, real), above)
             field = dfx.ODETerm(lambda t, s, args: s.rate(jnp.stack([s.y[1], -s.y[0]])))
-            how: dict[str, Any] = {"stepsize_controller": EventController(dfx.PIDController(1e-5, 1e-7))}
-            how["adjoint"] = dfx.ForwardMode()
-            done: Any = dfx.diffeqsolve(field, events, real(begin), real(begin + 1.6), None, start, above, **how)
-            return done.ys.log.t[-1, 0]
+            how: dict[str, Any] = {"stepsize_controller": control, "adjoint": dfx.ForwardMode()}
+            t0, t1 = jnp.asarray(begin, real), jnp.asarray(begin + 1.6, real)
+            done: Any = dfx.diffeqsolve(field, events, t0, t1, 1e-3, start, above, throw=False, **how)
+            return done.ys.log.t[-1, 0], done.result == dfx.RESULTS.successful
 
-        return jax.jvp(time_of, (above,), (jnp.ones_like(above),))
+        return jax.jvp(time_of, (above,), (jnp.ones_like(above),), has_aux=True)
 
     above = np.linspace(0.05, 0.95, 512, dtype=np.float32)
-    (t, slope), exact = passage(jnp.asarray(above)), above.astype(float)
+    t, slope, successful = (np.asarray(x) for x in passage(jnp.asarray(above)))
+    assert np.mean(successful) > 0.95  # stairs as wide as the resolution of time may end a run, but not in silence
+    t, slope, exact = t[successful], slope[successful], above[successful].astype(float)
     np.testing.assert_allclose(t, begin + np.arcsin(exact), rtol=4 * eps, atol=10 * max(root, stair))
     np.testing.assert_allclose(slope, 1 / np.sqrt(1 - exact**2), rtol=1e-3)
 

@@ -370,12 +370,12 @@ class EventSolver(AbstractSolverWrapper):
         missed = jnp.any(passed)
         landed = jnp.any(here) & ~missed & (length > 0)
         fired = here & landed
-        first = jnp.arange(fired.shape[0]) == jnp.argmin(jnp.where(fired, seen.ahead, jnp.inf))
+        order = jnp.where(seen.ahead < jnp.inf, seen.ahead, seen.root - 1.0)  # a guard in rounding may not fall
+        first = jnp.arange(fired.shape[0]) == jnp.argmin(jnp.where(fired, order, jnp.inf))
         ahead = jnp.where(missed, first_root(seen, passed), 1.0 + jnp.maximum(sight, 0.0))
         coming = jnp.argmin(jnp.where(missed, jnp.where(passed, seen.root, jnp.inf), seen.ahead))
-        near = jnp.sum(jnp.where(first, near, 0.0))
         next_end = self._policy.next_end(ahead, missed, (landing(ahead)[coming], divisor))
-        return Landing(fired, first, seen.ahead, missed, landed, landed, next_end, near)
+        return Landing(fired, first, order, missed, landed, landed, next_end, jnp.sum(jnp.where(first, near, 0.0)))
 
     def _guard_rates(self, t: Array, state: EventState, slope: PyTree, args: PyTree) -> Float[Array, " guards"]:
         """Rates of the guards along the motion; constant."""
