@@ -143,7 +143,8 @@ def test_velocities_pass_zero_at_the_default_tolerance() -> None:
         return done.result.ok, done.q[-1, 0]
 
     limits = np.linspace(0.97, 1.03, 64)
-    ends = [linear_stick_slip.motion(replace(system, Fc=np.array([Fc])), [0.0], [0.2], 12.0).q[0] for Fc in limits]
+    start = np.zeros(1), np.array([0.2])
+    ends = [linear_stick_slip.motion(replace(system, Fc=np.array([Fc])), *start, 12.0).q[0] for Fc in limits]
     ok, q = jax.jit(lambda x: jax.lax.map(run, x))(jnp.asarray(limits, F))
     assert ok.all()
     assert q.dtype == F

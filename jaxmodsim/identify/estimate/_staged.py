@@ -146,7 +146,7 @@ def _required(problem: FitProblem, sampled: _Sampled, values: Mapping[str, Array
         free = vector_field(s.t, State(q, qd, bare.initial_state(q)), bare).qd[0]
         return mass_of(here, s.t, q, qd) * (free - s.a)
 
-    return jax.vmap(required)(sampled)
+    return jax.jit(jax.vmap(required))(sampled)  # each operation alone would compile, too
 
 
 def _settled(law: AbstractLaw, v: Array) -> Array:
