@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._core.compat import programs_of
@@ -153,21 +152,15 @@ def _step_from(t: Array, scene: Scene) -> Scene:
     return scene.step_from(t)
 
 
-def _error_norm(scaled: PyTree) -> Array:
-    """Root mean square; infinite where an infinite state makes the ratio to it undefined."""
-    size = optx.rms_norm(scaled)
-    return jnp.where(jnp.isnan(size), jnp.inf, size)
-
-
 def _controller(request: RunRequest, solver: dfx.AbstractSolver) -> dfx.AbstractStepSizeController:
     p, i = _ROSENBROCK_GAINS if isinstance(solver, Rodas5P) and not request.scene.mode_names else _GAINS
     steps = {"dtmin": request.shortest_step, "dtmax": request.dtmax, "force_dtmin": False}
-    adaptive = dfx.PIDController(*_tolerances(request), pcoeff=p, icoeff=i, norm=_error_norm, **steps)
+    adaptive = dfx.PIDController(*_tolerances(request), pcoeff=p, icoeff=i, **steps)
     controller = adaptive if request.dt is None else FiniteSteps()
     times = sample_times(request.scene.params, linear=True)
     if request.scene.mode_names:
         return EventController(controller, times, direction=1)
-    return controller if times is None else StepsTo(controller, times)
+    return StepsTo(controller, times)
 
 
 def _plugins(request: RunRequest, system: IntegratedSystem) -> tuple[Any, Any]:

@@ -147,7 +147,7 @@ class ProbedController(NamedTuple):
         def with_probe(x: PyTree) -> PyTree:
             if not _is_pid(x):
                 return x
-            norm: Callable[[PyTree], Array] = x.norm  # of one number its size, and infinite if it is NaN
+            norm: Callable[[PyTree], Array] = x.norm  # of one number its size
             return eqx.tree_at(lambda x: x.norm, x, lambda scaled: norm(jnp.maximum(norm(scaled), of_probe)))
 
         controller = jtu.tree_map(with_probe, self.controller, is_leaf=_is_pid)

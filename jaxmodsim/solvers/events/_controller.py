@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, PyTree
 
 from ..._core.arrays import Fn, Real, fusion_barrier, is_one_of, opaque_one
-from .._controllers import FiniteSteps, end_at
+from .._controllers import FiniteSteps, end_at, without_infinity
 from .._equation import check_ode
 from .._wrapper import AbstractControllerWrapper
 from ._state import ACCUMULATION, TOO_MANY, EventState
@@ -140,10 +140,8 @@ class EventController(AbstractControllerWrapper):
     ) -> tuple[Array, Array, Array, Array, _ControllerState, dfx.RESULTS]:
         """As the wrapped controller, but reject a step that passes an event or does not resolve the guards."""
         old, seen, t0, t1 = controller_state, y1_candidate.report, jnp.asarray(t0), jnp.asarray(t1)
-        # diffrax rejects a step to NaN; a step to infinity has an error of inf / inf, and so has each one after it.
-        y1 = jtu.tree_map(lambda y: jnp.where(jnp.isinf(y), jnp.nan, y), y1_candidate.y)
         keep, inner_t0, inner_t1, jump, inner, result = self.controller.adapt_step_size(
-            t0, t1, y0.y, y1, args, y_error, error_order, old.inner
+            t0, t1, y0.y, without_infinity(y1_candidate.y), args, y_error, error_order, old.inner
         )
         length = _constant(t1 - t0)
         next_root, factor, landed = _constant(seen.next_root), _constant(seen.step_factor), _constant(seen.landed) > 0.5
