@@ -12,30 +12,6 @@ from .case import HardCase, motion, position
 FAMILY = "loads in stick"
 
 
-def _system(
-    load: Sequence[Sequence[float]],
-    limits: Sequence[tuple[float, float]],
-    frequencies: Sequence[float] = (),
-    *,
-    mass: float = 2.0,
-    stiffness: float | np.ndarray = 0.0,
-    directions: Sequence[Sequence[float]] | None = None,
-    belt: Sequence[float] = (),
-) -> linear_stick_slip.LinearStickSlip:
-    """From what is not zero; (Fc, Fs) of each element."""
-    n, count, m = len(load), 5 + 4 * len(frequencies), len(limits)
-    loads, belts = np.zeros((n, count)), np.zeros((m, count))
-    for row, given in zip(loads, load, strict=True):
-        row[: len(given)] = given
-    belts[:, : len(belt)] = belt
-    rows = np.eye(n) if directions is None else np.array(directions, float)
-    Fc, Fs = np.array(limits).T
-    springs = np.ones((1, 1)) * stiffness if n == 1 else np.zeros((n, n)) + stiffness
-    return linear_stick_slip.LinearStickSlip(
-        mass * np.eye(n), np.zeros((n, n)), springs, rows, Fc, Fs, np.array(frequencies), loads, belts
-    )
-
-
 def _case(
     name: str,
     why: str,
@@ -68,7 +44,7 @@ def _with_samples(
 
 def _boxes() -> list[HardCase]:
     a, g, w = 0.8441173414514593, 0.09826644620612397, 2.9358368442770417
-    growing = _system([[0.0, 0.0, 0.0, a, 0.0, a * g]], [(1.0, 1.5)], [w])
+    growing = linear_stick_slip.system([[0.0, 0.0, 0.0, a, 0.0, a * g]], [(1.0, 1.5)], [w])
     t = float(linear_stick_slip.motion(growing, np.zeros(1), np.zeros(1), 10.0).times[0])
     steps = (
         "The steps have grown over the load while nothing moved: break-aways are missed or come late, without a word."
@@ -94,7 +70,7 @@ def _boxes() -> list[HardCase]:
             "touching_load",
             "The peaks of the load stay below the limit by 1e-5 of it, 38 times.",
             "A tolerance in the search for the event lets the box go.",
-            _system([[0.0, 0.0, 0.0, 1.5 * (1.0 - 1e-5)]], [(1.0, 1.5)], [6.0]),
+            linear_stick_slip.system([[0.0, 0.0, 0.0, 1.5 * (1.0 - 1e-5)]], [(1.0, 1.5)], [6.0]),
             20.0,
             scale=1.0,
         ),
@@ -102,7 +78,7 @@ def _boxes() -> list[HardCase]:
             "exceeding_load",
             "The peaks of the load exceed the limit by 1e-5 of it, for 1.5 ms.",
             steps,
-            _system([[0.0, 0.0, 0.0, 1.5 * (1.0 + 1e-5)]], [(1.0, 1.5)], [6.0]),
+            linear_stick_slip.system([[0.0, 0.0, 0.0, 1.5 * (1.0 + 1e-5)]], [(1.0, 1.5)], [6.0]),
             19.4,
             # The time of an exceedance is known to the square root of rounding.
             single=None,
@@ -111,7 +87,7 @@ def _boxes() -> list[HardCase]:
             "slow_load_with_ripple",
             "A load that rises for 1e4 s, with ripple of 0.01 N every 31 s that decides when slip begins.",
             "Steps grow over the ripple: slip begins late by up to half of its period.",
-            _system([[0.0, 1.5e-4, 0.0, 0.01]], [(1.0, 1.5)], [0.2]),
+            linear_stick_slip.system([[0.0, 1.5e-4, 0.0, 0.01]], [(1.0, 1.5)], [0.2]),
             1.005e4,
             # Times of 1e4 s are known to 1e-3 s.
             single=None,
@@ -130,21 +106,25 @@ def _several() -> list[HardCase]:
             "two_elements_together",
             "A box with two elements, which share the load in stick and break away at one instant.",
             together,
-            _system([[0.1, 0.0, 0.0, 2.4]], [(1.0, 1.4), (0.5, 0.6)], [3.0], directions=[[1.0], [1.0]]),
+            linear_stick_slip.system(
+                [[0.1, 0.0, 0.0, 2.4]], [(1.0, 1.4), (0.5, 0.6)], [3.0], directions=[[1.0], [1.0]]
+            ),
             9.0,
         ),
         _case(
             "mirrored_boxes",
             "Two equal boxes under opposite loads, joined by a spring: what one does, the other does at once.",
             together,
-            _system([[0.0, 0.0, 0.0, 2.0], [0.0, 0.0, 0.0, -2.0]], [(1.0, 1.3)] * 2, [2.0], stiffness=pair),
+            linear_stick_slip.system(
+                [[0.0, 0.0, 0.0, 2.0], [0.0, 0.0, 0.0, -2.0]], [(1.0, 1.3)] * 2, [2.0], stiffness=pair
+            ),
             8.0,
         ),
         _case(
             "belt_that_swings",
             "A box on a spring and on a belt whose velocity swings through zero: it sticks and lags in turns.",
             "In stick the belt carries the box, and steps that fit the spring pass over the load of its acceleration.",
-            _system([[]], [(1.0, 1.5)], [1.7], mass=1.0, stiffness=4.0, belt=[0.2, 0.0, 0.0, 0.3]),
+            linear_stick_slip.system([[]], [(1.0, 1.5)], [1.7], mass=1.0, stiffness=4.0, belt=[0.2, 0.0, 0.0, 0.3]),
             12.0,
             qd0=0.2,
             # So do half of the runs from velocities within a tenth of this one; the others are right to 1e-6.
@@ -154,7 +134,7 @@ def _several() -> list[HardCase]:
             "chain_with_neighbours",
             "Three masses with friction on the ground and between neighbours: five elements on three coordinates.",
             "Which elements hold is not unique where all rest; a wrong choice lets slip begin where there is none.",
-            _system(
+            linear_stick_slip.system(
                 [[0.0, 0.0, 0.0, 2.5], [], [0.4]], limits, [1.9], mass=1.0, stiffness=3.0 * row, directions=neighbours
             ),
             5.0,

@@ -7,6 +7,7 @@ exponentials, which are exact but for rounding.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
@@ -463,6 +464,30 @@ class _WeightedSum(eqx.Module):
     def __call__(self, x: Array) -> Array:
         """The row times q, or times the waves at t."""
         return jnp.sum(self.row * (x if self.frequencies is None else _waves(x, self.frequencies)))
+
+
+def system(
+    load: Sequence[Sequence[float]],
+    limits: Sequence[tuple[float, float]],
+    frequencies: Sequence[float] = (),
+    *,
+    mass: float = 2.0,
+    stiffness: float | np.ndarray = 0.0,
+    directions: Sequence[Sequence[float]] | None = None,
+    belt: Sequence[float] = (),
+) -> LinearStickSlip:
+    """The system of equal masses without damping, from what is not zero, and (Fc, Fs) of each element."""
+    n, count, m = len(load), 5 + 4 * len(frequencies), len(limits)
+    loads, belts = np.zeros((n, count)), np.zeros((m, count))
+    for row, given in zip(loads, load, strict=True):
+        row[: len(given)] = given
+    belts[:, : len(belt)] = belt
+    rows = np.eye(n) if directions is None else np.array(directions, float)
+    Fc, Fs = np.array(limits).T
+    springs = np.ones((1, 1)) * stiffness if n == 1 else np.zeros((n, n)) + stiffness
+    return LinearStickSlip(
+        mass * np.eye(n), np.zeros((n, n)), springs, rows, Fc, Fs, np.array(frequencies), loads, belts
+    )
 
 
 def scene(system: LinearStickSlip, *, moving: bool | None = None) -> Scene:

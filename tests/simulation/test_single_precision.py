@@ -132,9 +132,7 @@ def test_a_bristle_that_overflows_in_a_long_step_is_integrated_by_shorter_ones()
 
 def test_velocities_pass_zero_at_the_default_tolerance() -> None:
     """A box on a spring that sticks to a belt whose velocity swings through zero, for 64 limits."""
-    belt = np.array([[0.2, 0.0, 0.0, 0.3, 0.0, 0.0, 0.0, 0.0, 0.0]])
-    still, one, Fs = np.zeros((1, 9)), np.ones((1, 1)), np.array([1.5])
-    system = linear_stick_slip.LinearStickSlip(one, 0.0 * one, 4.0 * one, one, Fs, Fs, np.array([1.7]), still, belt)
+    system = linear_stick_slip.system([[]], [(1.5, 1.5)], [1.7], mass=1.0, stiffness=4.0, belt=[0.2, 0.0, 0.0, 0.3])
     scene = jax.tree.map(lambda x: jnp.asarray(x, F), linear_stick_slip.scene(system))
 
     def run(Fc: Any) -> Any:
