@@ -6,7 +6,7 @@ from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from ..._core.arguments import as_float, as_label, as_mapping, as_names, as_reals
 from ..._core.arrays import on_device
@@ -241,29 +241,27 @@ class Runs(NamedTuple):
     slip_weight: dict[str, Float[Array, "runs instants"]]
 
 
-class Windows(NamedTuple):
-    """The windows of records that are the runs.
+class Window(NamedTuple):
+    """The window of a record that is a run.
 
-    - `record`, `first`, `last`: index of the record and of its first and last sample, for each run; the last sample is
-      also the first of the next run if they are `linked`.
-    - `linked`: whether the next run continues from the end of this one, shape `[runs - 1]`.
+    - `record`, `first`, `last`: index of the record and of its first and last sample.
+    - `linked`: whether the next run continues from the end of this one; its first sample is then the last one here.
     """
 
-    record: tuple[int, ...]
-    first: tuple[int, ...]
-    last: tuple[int, ...]
-    linked: Bool[np.ndarray, " links"]
+    record: int
+    first: int
+    last: int
+    linked: bool
 
 
-def cut(records: tuple[Record, ...], window: float | None) -> Windows:
+def cut(records: tuple[Record, ...], window: float | None) -> tuple[Window, ...]:
     """Whole records, or windows of about this length [s]; each ends with the first sample of the next.
 
     **Raises:**
 
     - `ValueError` for a window shorter than two samples.
     """
-    record, first, last, linked = [], [], [], []
-    steps = None
+    windows, steps = [], None
     if window is not None:
         span = max(float(np.median(np.diff(each.t))) for each in records)
         if not (np.isfinite(window) and window >= 2 * span):
@@ -274,21 +272,16 @@ def cut(records: tuple[Record, ...], window: float | None) -> Windows:
         edges = [0, samples - 1] if steps is None else [*range(0, samples - 1, steps), samples - 1]
         if len(edges) > 2 and edges[-1] - edges[-2] < (steps or 0) // 4:
             del edges[-2]  # too short to show its own start
-        for a, b in pairwise(edges):
-            record.append(i)
-            first.append(a)
-            last.append(b)
-            linked.append(b != edges[-1])
-    return Windows(tuple(record), tuple(first), tuple(last), np.array(linked[:-1], bool))
+        windows += [Window(i, a, b, b != edges[-1]) for a, b in pairwise(edges)]
+    return tuple(windows)
 
 
-def runs_of(records: tuple[Record, ...], windows: Windows) -> Runs:
+def runs_of(records: tuple[Record, ...], windows: tuple[Window, ...]) -> Runs:
     """The samples of the windows as arrays of one shape."""
-    longest = max(b - a for a, b in zip(windows.first, windows.last, strict=True)) + 1
+    longest = max(each.last - each.first for each in windows) + 1
     channels = list(dict.fromkeys(channel for record in records for channel in record.channels))
     effects = list(dict.fromkeys(effect for record in records for effect in record.slips))
-    parts = [records[i].samples(a, b + 1) for i, a, b in zip(windows.record, windows.first, windows.last, strict=True)]
-    continues = [*windows.linked.tolist(), False]
+    parts = [records[each.record].samples(each.first, each.last + 1) for each in windows]
     instants = max((len(x) for part in parts for x in part.slips.values()), default=0)
 
     def column(values: Sequence[np.ndarray] | np.ndarray) -> Array:
@@ -316,7 +309,7 @@ def runs_of(records: tuple[Record, ...], windows: Windows) -> Runs:
             for name in channels
         },
         {
-            name: column([counts(part, name, goes_on) for part, goes_on in zip(parts, continues, strict=True)])
+            name: column([counts(part, name, each.linked) for part, each in zip(parts, windows, strict=True)])
             for name in channels
         },
         {name: column(np.where(np.isfinite(x), x, 0.0)) for name, x in instants_by_effect.items()},

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.ndimage import median_filter
 
 from ._record import Record
 
@@ -56,7 +57,7 @@ def smooth_span(samples: int) -> int:
 
 def outliers(x: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"]:
     """Samples that differ from their neighbours on both sides, as from a sensor that drops out."""
-    deviation, steps = np.abs(x - _local_median(x)), np.abs(np.diff(x))
+    deviation, steps = np.abs(x - median_filter(x, _NEIGHBOURS, mode="nearest")), np.abs(np.diff(x))
     step = float(np.median(steps[steps > 0])) if steps.any() else 0.0
     usual = max(float(np.quantile(deviation, _NEARLY_ALL)), step)
     return deviation > _STANDS_OUT * usual
@@ -65,7 +66,7 @@ def outliers(x: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"]:
 def without_outliers(x: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
     """The samples with outliers replaced by the median of their neighbours."""
     bad = outliers(x)
-    return np.where(bad, _local_median(x), x) if bad.any() else x
+    return np.where(bad, median_filter(x, _NEIGHBOURS, mode="nearest"), x) if bad.any() else x
 
 
 def sample_noise(x: Float[np.ndarray, " samples"]) -> float:
@@ -82,11 +83,6 @@ def sample_noise(x: Float[np.ndarray, " samples"]) -> float:
     rounding = float(np.finfo(float).eps * np.max(np.abs(x)))
     seen = min(levels) if np.isfinite(min(levels)) else 0.0
     return max(seen, resolution(x) / 12.0**0.5, rounding, _TINY)
-
-
-def _local_median(x: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
-    side = _NEIGHBOURS // 2
-    return np.median(np.lib.stride_tricks.sliding_window_view(np.pad(x, side, mode="edge"), _NEIGHBOURS), axis=-1)
 
 
 def differentiate(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]) -> SmoothedMotion:

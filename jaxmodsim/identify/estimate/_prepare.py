@@ -14,11 +14,13 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..._core.arguments import as_float, as_mapping, as_names, as_reals, as_whole
 from ..._core.arrays import on_device
+from ..._core.functions import is_state_dependent
 from ..._core.parameters import Range, check_not_nan, check_ranges, modules_of
+from ...friction import AbstractLaw
 from ...scene import Scene, State, check_scene, scene_numbers, scene_ranges
-from ..data._record import Record, Windows, cut, runs_of, slip_channel
+from ..data._record import Record, Window, cut, runs_of, slip_channel
 from ..data._signals import start_errors, start_state
-from ..model._engines import DELAY, Controller, EventEngine, ReplayEngine
+from ..model._engines import DELAY, Controller, EventEngine, LawEngine, ReplayEngine
 from ..model._observe import Observable, Observables, by_channel, check_observables, coordinates_seen
 from ..model._parameters import FreeParameters, chosen_entries, split_entries, split_ranges
 from ._problem import AbstractLoss, FitProblem, Prior, SquaredLoss, local_names
@@ -97,17 +99,23 @@ class FitOptions(eqx.Module):
 
 @dataclass(frozen=True)
 class Prepared:
-    """A problem, its records and windows, units by name, and the channels with known noise."""
+    """A problem, its records and windows, and units by name."""
 
     problem: FitProblem
     records: tuple[Record, ...]
-    windows: Windows
+    windows: tuple[Window, ...]
     units: dict[str, str]
-    known_noise: frozenset[str]
+
+    @property
+    def known_noise(self) -> frozenset[str]:
+        """The channels whose noise the records state."""
+        return frozenset(name for record in self.records for name in record.noise)
 
 
 def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str], options: FitOptions) -> Prepared:
     """Check everything, with the errors of `fit`, and build the problem."""
+    if not isinstance(scene, Scene):
+        raise ValueError(f"scene must be a Scene, but {scene!r} was given.")
     several = records_of(records)
     _check_inputs(scene, several)
     for _, module in modules_of(scene):
@@ -150,9 +158,51 @@ def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str
         len(unknown),
         _shown_by_opening(several, observables, (*local, *unknown), unknown, states.q.shape[1]),
     )
-    known = frozenset(name for record in several for name in record.noise)
-    units = {name: allowed.unit for name, allowed in ranges.items()}
-    return Prepared(problem, several, windows, units, known)
+    return Prepared(problem, several, windows, {name: allowed.unit for name, allowed in ranges.items()})
+
+
+def prepare_law(
+    law: AbstractLaw, records: Record | Sequence[Record], free: Sequence[str] | None, loss: AbstractLoss | None
+) -> Prepared:
+    """Check everything, with the errors of `fit_law`, and build the problem."""
+    several = records_of(records)
+    for each in several:
+        if "x" not in each.inputs or not (is_state_dependent(law) or set(each.inputs) <= {"x", "normal"}):
+            raise ValueError(
+                "fit_law needs the input 'x' [m] and may take 'normal' [N], and more only for a law that scaled_by lets"
+                f" depend on it; the record has: {', '.join(each.inputs)}."
+            )
+    numbers, ranges = scene_numbers(law), scene_ranges(law)
+    single, ranges = split_entries(numbers), split_ranges(numbers, ranges)
+    chosen = _off_limits(single, ranges) if free is None else chosen_entries(numbers, free)
+    parameters = FreeParameters.of(single, ranges, chosen)
+    windows = cut(several, None)
+    problem = FitProblem(
+        LawEngine(law),
+        parameters,
+        (),
+        None,
+        runs_of(several, windows),
+        {name: on_device(noise_level(name, several)) for each in several for name in each.channels},
+        SquaredLoss() if loss is None else loss,
+        Prior.of({}, parameters.names),
+    )
+    per_load = " per N" if "normal" in several[0].inputs else ""
+    units = {
+        name: allowed.unit + (per_load if allowed.unit.startswith("N") else "") for name, allowed in ranges.items()
+    }
+    return Prepared(problem, several, windows, units)
+
+
+def _off_limits(numbers: dict[str, Array], ranges: dict[str, Range]) -> tuple[str, ...]:
+    """Names of the parameters that start off their limits and are not numerical."""
+    free = []
+    for name, value in numbers.items():
+        lower = ranges[name].lower if name in ranges else None
+        limit = numbers[lower] if isinstance(lower, str) else lower
+        if not (name in ranges and ranges[name].execution) and (limit is None or bool(value > limit)):
+            free.append(name)
+    return tuple(free)
 
 
 def records_of(records: object) -> tuple[Record, ...]:
@@ -323,15 +373,16 @@ def _passive(effects: tuple[str, ...], numbers: Mapping[str, Array]) -> dict[str
 def _bases(
     scene: Scene,
     records: tuple[Record, ...],
-    windows: Windows,
+    windows: tuple[Window, ...],
     states: State,
     observables: Observables,
 ) -> State:
     """Initial state of each run: that of its record, or what was measured where a window begins."""
-    q, qd = (np.asarray(each)[list(windows.record)] for each in (states.q, states.qd))
-    for run, (i, first) in enumerate(zip(windows.record, windows.first, strict=True)):
-        if first > 0:
-            rest = records[i].samples(first, len(records[i].t))
+    q, qd = (np.asarray(each)[[window.record for window in windows]] for each in (states.q, states.qd))
+    for run, window in enumerate(windows):
+        if window.first > 0:
+            record = records[window.record]
+            rest = record.samples(window.first, len(record.t))
             q[run], qd[run] = measured_start(rest, observables, q.shape[1])
     return initial_states(scene, on_device(q), on_device(qd))
 
@@ -374,8 +425,8 @@ def noise_level(channel: str, records: tuple[Record, ...]) -> float:
     return size or 1.0
 
 
-def _jump(shooting: MultipleShooting | None, windows: Windows, base: State) -> Array | None:
-    if shooting is None or shooting.jump is None or not windows.linked.size:
+def _jump(shooting: MultipleShooting | None, windows: tuple[Window, ...], base: State) -> Array | None:
+    if shooting is None or shooting.jump is None or len(windows) == 1:
         return None
     position, velocity = shooting.jump
     first = jax.tree.map(lambda x: x[0], base)
@@ -385,7 +436,7 @@ def _jump(shooting: MultipleShooting | None, windows: Windows, base: State) -> A
         jax.tree.map(lambda x: jnp.full_like(x, position), first.z),
     )
     flat, _ = ravel_pytree(sizes)
-    return jnp.asarray(windows.linked, float)[:, None] / flat[None, :]
+    return jnp.asarray([window.linked for window in windows[:-1]], float)[:, None] / flat[None, :]
 
 
 def step_error(search: SearchResult) -> float | None:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from ..._core.arrays import on_device
-from ..data._record import Windows
+from ..data._record import Window
 from ._problem import AbstractLoss, Box, FitProblem
 
 # `x` -> residual and its Jacobian.
@@ -133,14 +133,14 @@ class SearchOptions:
 class SearchResult:
     """The end of a search: the problem with its last noise levels, the best iterate, and the reason.
 
-    - `windows`: of the records that are its runs; None until it is the search of a result.
+    - `windows`: of the records that are its runs; none until it is the search of a result.
     """
 
     problem: FitProblem
     state: SearchState
     iterations: int
     ending: str
-    windows: Windows | None = None
+    windows: tuple[Window, ...] = ()
 
     @property
     def residuals(self) -> dict[str, tuple[Float[np.ndarray, "runs samples"], Float[np.ndarray, "runs samples"]]]:

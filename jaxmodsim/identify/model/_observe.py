@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
+from scipy.integrate import cumulative_trapezoid
 
 from ..._core.arguments import as_mapping, did_you_mean
 from ..._core.arrays import on_device
@@ -181,7 +182,7 @@ def slip_of(effect: Friction | None, motion: RecordedMotion, params: PyTree, dof
         v = np.asarray(_slips(effect, params, *(on_device(each) for each in (motion.t, q, qd))))
     if v.ndim > 1 or not np.isfinite(v).all():
         return None
-    return Slip(np.concatenate([[0.0], np.cumsum(0.5 * np.diff(motion.t) * (v[1:] + v[:-1]))]), v)
+    return Slip(cumulative_trapezoid(v, motion.t, initial=0.0), v)
 
 
 @eqx.filter_jit

@@ -18,13 +18,13 @@ from ...friction import AbstractLaw
 from ...scene import Scene, State, scene_numbers
 from ..data._record import Record, Runs, cut, runs_of
 from ..estimate._initializers import AbstractInitializer, Continuation, FromSmaller, as_initializers, last_part
-from ..estimate._prepare import FitOptions, StartState, initial_states, measured_start, prepare
+from ..estimate._prepare import FitOptions, StartState, initial_states, measured_start, prepare, prepare_law
 from ..estimate._problem import AbstractLoss, FitProblem
 from ..estimate._search import Progress, SearchOptions, SearchResult, SearchState, solve
 from ..model._engines import DELAY
 from ..model._observe import Observable, by_channel, first_coordinate
 from ..model._parameters import split_entries
-from ..uncertainty._fit import fit_law, fit_scene
+from ..uncertainty._fit import fitted
 from ..uncertainty._result import FitResult
 from ._comparison import ENOUGH, Comparison, CrossValidated, Part, comparison_of
 from ._evaluation import after, begin, check_lengths, sample_counts, shown_starts
@@ -155,11 +155,10 @@ def compare(
     order = sorted(models, key=lambda name: sizes[name])
     judged: dict[str, CrossValidated] = {}
     failures: dict[str, str] = {}
-    judge = _validate_law if laws else _validate_scene
     with reported(progress, "compare", candidate_words) as report:
         for name in order:
             try:
-                judged[name] = judge(options, name, models[name], report, judged)
+                judged[name] = _validated(options, name, models[name], report, judged)
             except KeyboardInterrupt:
                 if not judged:
                     raise
@@ -212,11 +211,11 @@ def _progress_of(progress: CompareProgress | None, name: str, fold: int | None) 
 def _from_smaller(free: Sequence[str], judged: Mapping[str, CrossValidated]) -> tuple[AbstractInitializer, ...]:
     """From the fit of the largest model all of whose parameters are among `free`, by the last parts of their names."""
     names = {last_part(name) for name in free}
-    fitted = [
+    ends = [
         {last_part(name): on_device(each.values[name]) for name in _finished(each.search).problem.free.names}
         for each, _, _ in judged.values()
     ]
-    nested = [values for values in fitted if set(values) <= names]
+    nested = [values for values in ends if set(values) <= names]
     return (FromSmaller(max(nested, key=len)),) if nested else ()
 
 
@@ -230,31 +229,7 @@ def _finished(search: SearchResult | None) -> SearchResult:
     return search
 
 
-def _validate_law(
-    options: CompareOptions,
-    name: str,
-    candidate: Candidate,
-    report: CompareProgress | None,
-    judged: Mapping[str, CrossValidated],
-) -> CrossValidated:
-    """The fit to everything, then the residuals of each held-out block in a fit without it."""
-    law, folds = candidate.scene, options.folds
-    assert isinstance(law, AbstractLaw)
-    initializers = (*options.initializers, *_from_smaller(tuple(ranges_of(law)), judged))
-    result = fit_law(
-        law, options.records, candidate.free, loss=options.fit.loss, initializer=initializers,
-        max_steps=options.max_steps, progress=_progress_of(report, name, None) or False,
-    )  # fmt: skip
-    search = _finished(result.search)
-    problem, held = search.problem, []
-    block = _blocks(problem.runs, folds)
-    for fold in range(folds):
-        asked = SearchOptions(ENOUGH, options.max_steps, _progress_of(report, name, fold))
-        held += _held_out(problem, search.state.x, result, block == fold, block, asked)[0]
-    return CrossValidated(result, tuple(held), ())
-
-
-def _validate_scene(
+def _validated(
     options: CompareOptions,
     name: str,
     candidate: Candidate,
@@ -262,41 +237,40 @@ def _validate_scene(
     judged: Mapping[str, CrossValidated],
 ) -> CrossValidated:
     """The fit to everything, then the residuals of each held-out part in a fit without it."""
-    scene, free, folds = candidate.scene, candidate.free, options.folds
-    assert isinstance(scene, Scene)
-    assert free is not None
-    numbers = _names(scene, options.records)
-    own = [each for each in options.initializers if not isinstance(each, Continuation) or each.name in numbers]
+    model, free, folds, initializers = candidate.scene, candidate.free, options.folds, options.initializers
 
-    def search_options(fold: int | None) -> SearchOptions:
-        return SearchOptions(ENOUGH, options.max_steps, _progress_of(report, name, fold))
+    def search_options(fold: int | None, rtol: float = ENOUGH) -> SearchOptions:
+        return SearchOptions(rtol, options.max_steps, _progress_of(report, name, fold))
 
-    result = fit_scene(
-        scene,
-        options.records,
-        free,
-        options.fit_of(scene),
-        (*own, *_from_smaller(free, judged)),
-        replace(search_options(None), rtol=SearchOptions.rtol),
-    )
+    if isinstance(model, AbstractLaw):
+        prepared, free = prepare_law(model, options.records, free, options.fit.loss), tuple(ranges_of(model))
+    else:
+        assert free is not None
+        prepared, numbers = prepare(model, options.records, free, options.fit_of(model)), _names(model, options.records)
+        initializers = [each for each in initializers if not isinstance(each, Continuation) or each.name in numbers]
+    initializers = (*initializers, *_from_smaller(free, judged))
+    result = fitted(prepared, initializers, search_options(None, SearchOptions.rtol))
     search = _finished(result.search)
-    if options.hold_out:
-        problem = _with_own_starts(scene, options.hold_out, _measured_starts(search, options), search, options)
+    if isinstance(model, AbstractLaw):
+        problem, x = search.problem, search.state.x
         block = _blocks(problem.runs, folds)
-        x = _with_starts_of(problem, search)
+    elif options.hold_out:
+        problem = _with_own_starts(model, options.hold_out, _measured_starts(search, options), search, options)
+        block, x = _blocks(problem.runs, folds), _with_starts_of(problem, search)
         return CrossValidated(result, *_evaluated(problem, x, result, block, search_options(0)))
-    reached = _reached(search, options.records, folds)
-    problem = _with_own_starts(scene, options.windows, reached, search, options)
-    block = np.broadcast_to(np.arange(problem.count)[:, None] % folds, problem.runs.t.shape)
-    # Windows start as their first samples show. Free starts would take up errors of the model in the fitted windows,
-    # and the parameters would then not fit a window whose start does not.
-    x = _with_starts_of(problem, search)
-    pinned = problem.pinned(x, result.estimate.information)
-    tied = shown_starts(problem, _finished(begin(pinned, x, search_options(None))))
-    everything = _finished(solve(tied, x, search_options(None)))
-    parts = [_held_out(tied, everything.state.x, result, block == k, block, search_options(k)) for k in range(folds)]
-    held, fitted = zip(*parts, strict=True)
-    return CrossValidated(result, sum(held, ()), sum(fitted, ()))
+    else:
+        reached = _reached(search, options.records, folds)
+        problem = _with_own_starts(model, options.windows, reached, search, options)
+        block = np.broadcast_to(np.arange(problem.count)[:, None] % folds, problem.runs.t.shape)
+        # Windows start as their first samples show. Free starts would take up errors of the model in the fitted
+        # windows, and the parameters would then not fit a window whose start does not.
+        x = _with_starts_of(problem, search)
+        pinned = problem.pinned(x, result.estimate.information)
+        problem = shown_starts(problem, _finished(begin(pinned, x, search_options(None))))
+        x = _finished(solve(problem, x, search_options(None))).state.x
+    parts = [_held_out(problem, x, result, block == k, block, search_options(k)) for k in range(folds)]
+    held, start_fitted = zip(*parts, strict=True)
+    return CrossValidated(result, sum(held, ()), sum(start_fitted, ()))
 
 
 def _held_out(
@@ -308,8 +282,8 @@ def _held_out(
     options: SearchOptions,
 ) -> tuple[tuple[Part, ...], tuple[Part, ...]]:
     """Fit from `x` without the samples in the mask, and evaluate these."""
-    fitted = _finished(solve(problem.counting(~mask), x, options)).state.x
-    return _evaluated(problem.counting(mask), fitted, result, block, options)
+    x = _finished(solve(problem.counting(~mask), x, options)).state.x
+    return _evaluated(problem.counting(mask), x, result, block, options)
 
 
 def _evaluated(
@@ -330,8 +304,8 @@ def _evaluated(
         return _parts(search.problem, search.state, block), ()
     shown = _finished(begin(fixed, x, options)).state.x
     best = _finished(solve(fixed, shown, options)).state.x
-    held, fitted = (_parts(*after(fixed, each), block) for each in (shown, best))
-    return held, fitted
+    held, start_fitted = (_parts(*after(fixed, each), block) for each in (shown, best))
+    return held, start_fitted
 
 
 def _parts(problem: FitProblem, state: SearchState, block: Int[np.ndarray, "runs samples"]) -> tuple[Part, ...]:

@@ -10,28 +10,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..._core.arguments import as_float, as_whole
-from ..._core.arrays import on_device
-from ..._core.functions import is_state_dependent
-from ..._core.parameters import Range
 from ..._core.progress import iteration_words, reported
 from ...friction import AbstractLaw
-from ...scene import Scene, scene_numbers, scene_ranges
-from ..data._record import Record, Windows, cut, runs_of
+from ...scene import Scene, scene_numbers
+from ..data._record import Record, Window
 from ..data._signals import outliers, sampling_gaps
 from ..estimate._initializers import AbstractInitializer, as_initializers, run_initializers
-from ..estimate._prepare import FitOptions, MultipleShooting, StartState, noise_level, prepare, records_of, step_error
-from ..estimate._problem import AbstractLoss, FitProblem, Prior, SquaredLoss
-from ..estimate._search import (
-    Progress,
-    SearchOptions,
-    SearchResult,
-    continued,
-    solve_freed,
-    solve_with_noise,
-)
-from ..model._engines import Controller, LawEngine, with_values
+from ..estimate._prepare import FitOptions, MultipleShooting, Prepared, StartState, prepare, prepare_law, step_error
+from ..estimate._problem import AbstractLoss, SquaredLoss
+from ..estimate._search import Progress, SearchOptions, SearchResult, continued, solve_freed, solve_with_noise
+from ..model._engines import Controller, with_values
 from ..model._observe import Observable, coordinates_seen, first_coordinate
-from ..model._parameters import FreeParameters, chosen_entries, split_entries, split_ranges
 from ._estimate import (
     FitDiagnostics,
     FitProvenance,
@@ -156,24 +145,15 @@ def fit(
     initializers = as_initializers(initializer)
     rtol, max_steps = as_float(rtol, name="rtol", lower=0.0), as_whole(max_steps, name="max_steps")
     with reported(progress, "fit", iteration_words) as report:
-        return fit_scene(scene, records, free, options, initializers, SearchOptions(rtol, max_steps, report))
+        return fitted(prepare(scene, records, free, options), initializers, SearchOptions(rtol, max_steps, report))
 
 
-def fit_scene(
-    scene: Scene,
-    records: Record | Sequence[Record],
-    free: Sequence[str],
-    options: FitOptions,
-    initializers: Sequence[AbstractInitializer],
-    search_options: SearchOptions,
-) -> FitResult:
-    """`fit` with its arguments checked."""
-    if not isinstance(scene, Scene):
-        raise ValueError(f"scene must be a Scene, but {scene!r} was given.")
-    prepared = prepare(scene, records, free, options)
-    x, starts = run_initializers(initializers, prepared.problem.held, search_options)
-    search = solve_freed(prepared.problem, x, search_options, prepared.known_noise)
-    model = with_values(scene, search.problem.at(search.state.x).values)
+def fitted(prepared: Prepared, initializers: Sequence[AbstractInitializer], options: SearchOptions) -> FitResult:
+    """Search from the start of the initializers, and the result of its end."""
+    problem = prepared.problem
+    x, starts = run_initializers(initializers, problem.held, options)
+    search = solve_freed(problem, x, options, prepared.known_noise)
+    model = with_values(problem.engine.model, problem.at(search.state.x).values)
     return result_of(search, prepared.records, prepared.windows, prepared.units, model, starts)
 
 
@@ -228,56 +208,16 @@ def fit_law(
     {'sigma0': '2e+04', 'Fc': '3'}
     ```
     """
-    several = records_of(record)
-    for each in several:
-        if "x" not in each.inputs or not (is_state_dependent(law) or set(each.inputs) <= {"x", "normal"}):
-            raise ValueError(
-                "fit_law needs the input 'x' [m] and may take 'normal' [N], and more only for a law that scaled_by lets"
-                f" depend on it; the record has: {', '.join(each.inputs)}."
-            )
-    numbers, ranges = scene_numbers(law), scene_ranges(law)
-    single, ranges = split_entries(numbers), split_ranges(numbers, ranges)
-    chosen = _off_limits(single, ranges) if free is None else chosen_entries(numbers, free)
-    parameters = FreeParameters.of(single, ranges, chosen)
-    windows = cut(several, None)
-    known = frozenset(name for each in several for name in each.noise)
-    problem = FitProblem(
-        LawEngine(law),
-        parameters,
-        (),
-        None,
-        runs_of(several, windows),
-        {name: on_device(noise_level(name, several)) for each in several for name in each.channels},
-        SquaredLoss() if loss is None else loss,
-        Prior.of({}, parameters.names),
-    )
+    prepared = prepare_law(law, record, free, loss)
     with reported(progress, "fit", iteration_words) as report:
         options = SearchOptions(rtol, as_whole(max_steps, name="max_steps"), report)
-        x, starts = run_initializers(initializer, problem, options)
-        search = solve_with_noise(problem, x, options, known)
-    per_load = " per N" if "normal" in several[0].inputs else ""
-    units = {
-        name: allowed.unit + (per_load if allowed.unit.startswith("N") else "") for name, allowed in ranges.items()
-    }
-    fitted = with_values(law, search.problem.at(search.state.x).values)
-    return result_of(search, several, windows, units, fitted, starts)
-
-
-def _off_limits(numbers: dict[str, Array], ranges: dict[str, Range]) -> tuple[str, ...]:
-    """Names of the parameters that start off their limits and are not numerical."""
-    free = []
-    for name, value in numbers.items():
-        lower = ranges[name].lower if name in ranges else None
-        limit = numbers[lower] if isinstance(lower, str) else lower
-        if not (name in ranges and ranges[name].execution) and (limit is None or bool(value > limit)):
-            free.append(name)
-    return tuple(free)
+        return fitted(prepared, as_initializers(initializer), options)
 
 
 def result_of(
     search: SearchResult,
     records: tuple[Record, ...],
-    windows: Windows,
+    windows: tuple[Window, ...],
     units: dict[str, str],
     model: eqx.Module,
     starts: tuple[float, ...] = (),
@@ -287,7 +227,7 @@ def result_of(
     names, size, shown = list(free.names), len(free.names), problem.reported
     values, at_start = problem.at(state.x).vector.tolist(), [float(free.start[name]) for name in names]
     entries = list(range(size))
-    if problem.base is not None and len(set(windows.record)) == len(windows.record):
+    if problem.base is not None and len(windows) == len(records):
         before = np.asarray(jax.vmap(problem.local_values)(problem.base))[:, :shown]
         after = before + np.asarray(problem.split(state.x)[1])[:, :shown]
         for i, record in enumerate(records):
@@ -346,7 +286,6 @@ def result_of(
 def searched_on(result: FitResult, x: Float[Array, " n"], options: SearchOptions, times: int, where: str) -> FitResult:
     """The result of the same fit with its search continued from `x`; `times`, `where`: of continuations, in words."""
     before, provenance = result.search_for("A continued search"), result.provenance
-    assert before.windows is not None
     assert provenance.model is not None
     known = frozenset(name for record in provenance.records for name in record.noise)
     search = solve_with_noise(before.problem, x, options, known)
@@ -415,7 +354,7 @@ def _sample_issues(records: tuple[Record, ...], squares: bool) -> tuple[Identifi
 
 
 def _stitched(
-    search: SearchResult, records: tuple[Record, ...], windows: Windows
+    search: SearchResult, records: tuple[Record, ...], windows: tuple[Window, ...]
 ) -> tuple[tuple[dict[str, np.ndarray], ...], dict[str, float]]:
     """The model's output along each record, and the root mean squares of the differences."""
     problem = search.problem
@@ -426,7 +365,7 @@ def _stitched(
     for name, (residual, weight) in search.residuals.items():
         level = float(problem.noise[name])
         rmse[name] = level * float(np.sqrt(np.sum(residual[weight > 0] ** 2) / max(np.sum(weight > 0), 1)))
-        for run, (i, first, last) in enumerate(zip(windows.record, windows.first, windows.last, strict=True)):
+        for run, (i, first, last, _) in enumerate(windows):
             if name in outputs[i]:
                 counted = np.flatnonzero(weight[run, : last - first + 1] > 0)
                 outputs[i][name][first + counted] += level * residual[run, counted]

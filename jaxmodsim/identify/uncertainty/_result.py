@@ -373,11 +373,7 @@ def _read_fields(path: str | PathLike[str], wanted: list[str]) -> dict[str, Any]
 def _packed(x: object, name: str, arrays: dict[str, np.ndarray]) -> object:
     """In types of JSON, with numbers that are not finite as text; appends to `arrays`."""
     if isinstance(x, Record):
-        parts = {
-            "t": x.t, "channels": x.channels, "inputs": x.inputs, "name": x.name, "linear": tuple(sorted(x.linear)),
-            "noise": x.noise, "slips": x.slips,
-        }  # fmt: skip
-        return {"record": _packed(parts, name, arrays)}
+        return {"record": _packed({**vars(x), "linear": tuple(sorted(x.linear))}, name, arrays)}
     if isinstance(x, IdentifiabilityIssue):
         return {"issue": [x.sentence, list(x.about)]}
     if isinstance(x, Mapping):
