@@ -13,9 +13,8 @@ from jaxtyping import Array, ArrayLike, Float
 from ..._core.arguments import as_float, as_whole
 from ..._core.parameters import check_ranges, modules_of
 from ..._core.progress import reported
-from ..._core.trace_checks import traced
 from ...scene import Scene, State, check_scene, scene_numbers, scene_ranges
-from ..model._observe import first_coordinate
+from ..model._observe import check_observables, first_coordinate
 from ..model._parameters import FreeParameters, chosen_entries, split_entries, split_ranges
 from ..uncertainty._estimate import correlation_of, floored_inverse
 from ..uncertainty._result import FitResult
@@ -254,9 +253,7 @@ def _axis(
         check_ranges(module)
     rest = State(position, jnp.zeros_like(position), scene.initial_state(position))
     check_scene(scene, rest)
-    shape = getattr(traced(observe, name="observe(q, qd)", q=rest.q, qd=rest.qd), "shape", None)
-    if shape != ():
-        raise ValueError(f"observe(q, qd) returned the shape {shape}, but one number, shape (), is needed.")
+    check_observables((("the record", observe),), scene, rest)
     whole = scene_numbers(scene)
     numbers, ranges = split_entries(whole), split_ranges(whole, scene_ranges(scene))
     parameters = FreeParameters.of(numbers, ranges, chosen_entries(whole, free))

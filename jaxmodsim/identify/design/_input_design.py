@@ -18,6 +18,7 @@ from ...scene import Scene, State, replace_numbers, scene_numbers, vector_field
 from ...solvers import rosenbrock_step
 from ..model._engines import RODAS3, replay
 from ..model._parameters import join_entries
+from ..uncertainty._estimate import correlated
 
 # Relative standard error above which a number is undetermined; correlation above which two are indistinguishable.
 _VAGUE, _ALIKE = 0.5, 0.98
@@ -170,14 +171,8 @@ class InputDesign(AbstractReadable):
                 warnings.append(
                     f"{where}, {name} is not determined: its standard error would be {100 * share:.0f} % of its value."
                 )
-        names = list(self.values)
-        for i, first in enumerate(names):
-            for j in range(i):
-                if abs(self.best.correlation[i, j]) > _ALIKE:
-                    warnings.append(
-                        f"{where}, {names[j]} and {first} can hardly be told apart (correlation"
-                        f" {self.best.correlation[i, j]:+.3f})."
-                    )
+        for a, b, c in correlated(list(self.values), self.best.correlation, _ALIKE):
+            warnings.append(f"{where}, {a} and {b} can hardly be told apart (correlation {c:+.3f}).")
         full = [name for name, share in self.used.items() if share > _REACHED]
         if full:
             warnings.append(f"What limits it: {' and '.join(full)}.")

@@ -280,6 +280,12 @@ class FitProblem(eqx.Module):
         """The parameters at a known x, shape `[n]`."""
         return self.free.at(np.asarray(x)[: len(self.free.names)])
 
+    def slopes_at(self, x: ArrayLike) -> Float[np.ndarray, "n n"]:
+        """Derivatives by x, shape `[n]`, of the parameters and of the free numbers of the initial states."""
+        slopes, size = np.eye(np.size(x)), len(self.free.names)
+        slopes[:size, :size] = self.at(x).slopes
+        return slopes
+
     def start_of(self, base: State | None, moved: Float[Array, " local"]) -> State | None:
         """Initial state of one run."""
         if base is None or not self.local:

@@ -231,6 +231,20 @@ def solve(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) ->
     return SearchResult(problem, state, int(state.steps), continued(ending, rounds, at))
 
 
+def finished(search: SearchResult) -> SearchResult:
+    """A search that was not interrupted, and whose end is finite.
+
+    **Raises:**
+
+    - `KeyboardInterrupt` for an interrupted one, `RuntimeError` for values that are not finite.
+    """
+    if search.ending.startswith("interrupted"):
+        raise KeyboardInterrupt
+    if not np.isfinite(float(search.state.cost)):
+        raise RuntimeError("The fit ended with values that are not finite.")
+    return search
+
+
 @eqx.filter_jit
 def channels_seen(problem: FitProblem, x: Float[Array, " n"]) -> dict[str, Float[Array, "runs samples"]]:
     """Output of the model in each channel at `x`."""

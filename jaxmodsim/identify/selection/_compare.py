@@ -20,7 +20,7 @@ from ..data._record import Record, Runs, cut, runs_of
 from ..estimate._initializers import AbstractInitializer, Continuation, FromSmaller, as_initializers, last_part
 from ..estimate._prepare import FitOptions, StartState, initial_states, measured_start, prepare, prepare_law
 from ..estimate._problem import AbstractLoss, FitProblem
-from ..estimate._search import Progress, SearchOptions, SearchResult, SearchState, solve
+from ..estimate._search import Progress, SearchOptions, SearchResult, SearchState, finished, solve
 from ..model._engines import DELAY
 from ..model._observe import Observable, by_channel, first_coordinate
 from ..model._parameters import split_entries
@@ -212,21 +212,14 @@ def _from_smaller(free: Sequence[str], judged: Mapping[str, CrossValidated]) -> 
     """From the fit of the largest model all of whose parameters are among `free`, by the last parts of their names."""
     names = {last_part(name) for name in free}
     ends = [
-        {last_part(name): on_device(each.values[name]) for name in _finished(each.search).problem.free.names}
+        {
+            last_part(name): on_device(each.values[name])
+            for name in finished(each.search_for("A comparison")).problem.free.names
+        }
         for each, _, _ in judged.values()
     ]
     nested = [values for values in ends if set(values) <= names]
     return (FromSmaller(max(nested, key=len)),) if nested else ()
-
-
-def _finished(search: SearchResult | None) -> SearchResult:
-    """A search that was not interrupted, and whose end is finite."""
-    assert search is not None
-    if search.ending.startswith("interrupted"):
-        raise KeyboardInterrupt
-    if not np.isfinite(float(search.state.cost)):
-        raise RuntimeError("The fit ended with values that are not finite.")
-    return search
 
 
 def _validated(
@@ -250,7 +243,7 @@ def _validated(
         initializers = [each for each in initializers if not isinstance(each, Continuation) or each.name in numbers]
     initializers = (*initializers, *_from_smaller(free, judged))
     result = fitted(prepared, initializers, search_options(None, SearchOptions.rtol))
-    search = _finished(result.search)
+    search = finished(result.search_for("A comparison"))
     if isinstance(model, AbstractLaw):
         problem, x = search.problem, search.state.x
         block = _blocks(problem.runs, folds)
@@ -266,8 +259,8 @@ def _validated(
         # windows, and the parameters would then not fit a window whose start does not.
         x = _with_starts_of(problem, search)
         pinned = problem.pinned(x, result.estimate.information)
-        problem = shown_starts(problem, _finished(begin(pinned, x, search_options(None))))
-        x = _finished(solve(problem, x, search_options(None))).state.x
+        problem = shown_starts(problem, finished(begin(pinned, x, search_options(None))))
+        x = finished(solve(problem, x, search_options(None))).state.x
     parts = [_held_out(problem, x, result, block == k, block, search_options(k)) for k in range(folds)]
     held, start_fitted = zip(*parts, strict=True)
     return CrossValidated(result, sum(held, ()), sum(start_fitted, ()))
@@ -282,7 +275,7 @@ def _held_out(
     options: SearchOptions,
 ) -> tuple[tuple[Part, ...], tuple[Part, ...]]:
     """Fit from `x` without the samples in the mask, and evaluate these."""
-    x = _finished(solve(problem.counting(~mask), x, options)).state.x
+    x = finished(solve(problem.counting(~mask), x, options)).state.x
     return _evaluated(problem.counting(mask), x, result, block, options)
 
 
@@ -300,10 +293,10 @@ def _evaluated(
     pinned = problem.pinned(x, result.estimate.information)
     fixed = eqx.tree_at(lambda p: p.known, pinned, {name: 0 * each for name, each in problem.known.items()})
     if not problem.local:
-        search = _finished(solve(fixed, x, options))
+        search = finished(solve(fixed, x, options))
         return _parts(search.problem, search.state, block), ()
-    shown = _finished(begin(fixed, x, options)).state.x
-    best = _finished(solve(fixed, shown, options)).state.x
+    shown = finished(begin(fixed, x, options)).state.x
+    best = finished(solve(fixed, shown, options)).state.x
     held, start_fitted = (_parts(*after(fixed, each), block) for each in (shown, best))
     return held, start_fitted
 

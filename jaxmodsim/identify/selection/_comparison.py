@@ -12,7 +12,7 @@ from ..._core.readable import AbstractReadable, Table, table_of
 from ..._core.system import jsonable
 from ..estimate._problem import AbstractLoss
 from ..estimate._search import SearchResult, weighted_by
-from ..uncertainty._estimate import sample_blocks
+from ..uncertainty._estimate import in_unit_columns, sample_blocks
 from ..uncertainty._residual_tests import effective_samples
 from ..uncertainty._result import FitResult
 from ._agreement import VARIATION, change_between, covariances, mean_variances
@@ -53,8 +53,7 @@ def penalty(search: SearchResult) -> float:
     """
     rows = search.problem.samples
     residual, jacobian = (each[:rows] for each in weighted_by(search.problem.loss, search.state))
-    size = np.linalg.norm(jacobian, axis=0)
-    scaled = jacobian / np.where(size > 0, size, 1.0)
+    scaled, size = in_unit_columns(jacobian)
     values, vectors = np.linalg.eigh(scaled.T @ scaled)
     known = values > _LEAST * values[-1]
     blocks, count = sample_blocks(search.problem)

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
@@ -20,6 +20,7 @@ from ..estimate._problem import FitProblem, Prior, SquaredLoss
 from ..estimate._search import SearchOptions, SearchResult, SearchState, channels_seen, solve, state_at
 from ..model._engines import DELAY, EventEngine, ReplayEngine
 from ..model._parameters import FreeParameters
+from ..uncertainty._estimate import in_unit_columns
 from ..uncertainty._result import FitResult
 
 RecordStart: TypeAlias = ArrayLike | Sequence[ArrayLike] | None
@@ -93,10 +94,9 @@ def shown_starts(problem: FitProblem, begun: SearchResult) -> FitProblem:
 
 def start_errors_of(jacobian: Float[np.ndarray, "rows local"]) -> Float[np.ndarray, " local"]:
     """Standard errors of a start from the Jacobian of its residual; infinite for numbers without effect."""
-    size = np.linalg.norm(jacobian, axis=0)
-    scaled = jacobian / np.where(size > 0, size, 1.0)
+    scaled, size = in_unit_columns(jacobian)
     error = np.sqrt(np.diag(np.linalg.pinv(scaled.T @ scaled, rcond=1e-12, hermitian=True)))
-    return np.where(size > 0, error / np.where(size > 0, size, 1.0), np.inf)
+    return np.where(np.any(jacobian, axis=0), error / size, np.inf)
 
 
 def after(problem: FitProblem, x: Float[Array, " n"]) -> tuple[FitProblem, SearchState]:
@@ -116,6 +116,9 @@ class Score:
     - `q0`, `qd0`: coordinates and velocities at the first sample, shape `[dof]`; None for a law by itself.
     - `opening`: number of the first samples that the start was fitted to; 0 for a known start.
     - `start_fitted`: the same samples with a start fitted to the whole record; None for a law by itself.
+    - `away`: distance of each number of a start that was fitted to the whole record, such as `q0[0]`, from the value
+      that the first samples show, in standard errors of that value; without the numbers that they do not show.
+    - `ending`: how the search for such a start ended; empty for others.
     """
 
     record: Record
@@ -125,7 +128,9 @@ class Score:
     q0: Float[np.ndarray, " dof"] | None
     qd0: Float[np.ndarray, " dof"] | None
     opening: int = 0
-    start_fitted: "StartFitted | None" = None
+    start_fitted: "Score | None" = None
+    away: dict[str, float] = field(default_factory=dict)
+    ending: str = ""
 
     @property
     def residuals(self) -> dict[str, Float[np.ndarray, " samples"]]:
@@ -150,22 +155,6 @@ class Score:
             for name, x in away.items()
             if abs(x) > _FAR
         )
-
-
-@dataclass(frozen=True, kw_only=True)
-class StartFitted:
-    """A record with the state at its first sample fitted to all of its samples.
-
-    - `rmse`: by channel, as in `Score`. `q0`, `qd0`: the state, shape `[dof]`. `ending`: how the search ended.
-    - `away`: distance of each number of the state, such as `q0[0]`, from the value that the first samples show, in
-      standard errors of that value; without the numbers that they do not show.
-    """
-
-    rmse: dict[str, float]
-    q0: Float[np.ndarray, " dof"]
-    qd0: Float[np.ndarray, " dof"]
-    away: dict[str, float]
-    ending: str
 
 
 def evaluate_on(result: FitResult, record: Record, *, q0: RecordStart = None, qd0: RecordStart = None) -> Score:
@@ -282,12 +271,9 @@ def score_of(run: RecordRun) -> Score:
     if not problem.local:
         return score
     best = solve(problem, run.x, SearchOptions())
-    fitted = _score_at(run, best.state.x)
-    assert fitted.q0 is not None
-    assert fitted.qd0 is not None
     moved = np.asarray(best.state.x - run.x)
     away = {name: float(d / e) for name, d, e in zip(problem.local, moved, run.errors, strict=True) if np.isfinite(e)}
-    start = StartFitted(rmse=fitted.rmse, q0=fitted.q0, qd0=fitted.qd0, away=away, ending=best.ending)
+    start = dataclasses.replace(_score_at(run, best.state.x), away=away, ending=best.ending)
     return dataclasses.replace(score, opening=int(np.sum(~run.counts)), start_fitted=start)
 
 

@@ -19,6 +19,7 @@ from ..estimate._problem import FitProblem, Prior, SquaredLoss
 from ..estimate._search import SearchOptions, SearchResult, channels_seen, solve
 from ..model._parameters import FreeParameters
 from ..model._servo import SERVO_LAWS, Servo, ServoEngine, servo_windows
+from ..uncertainty._estimate import correlated
 from ..uncertainty._fit import result_of
 from ..uncertainty._result import FitResult
 
@@ -39,6 +40,8 @@ _MAD = 0.6745
 # Share of the standard deviation of the prior above which an error is that of the prior; correlation that is reported.
 _VAGUE, _TOGETHER = 0.5, 0.9
 _KIND = "jaxmodsim servo fit"
+# Fields that are saved as they are.
+_SAVED = ("law", "members", "left_out", "fitted", "band", "evaluations", "prior", "from_duty")
 
 Numbers = dict[str, float]
 PriorNumbers = Mapping[str, tuple[float, float]]
@@ -80,16 +83,13 @@ class ServoFit:
             return ()
         errors, values = self.result.errors, self.result.values
         vague = [name for name, x in values.items() if not errors[name] < _VAGUE * self.prior[name][1]]
-        estimate, names = self.result.estimate, list(values)
-        pairs = [
-            f"{names[j]} and {names[i]} ({estimate.correlation[i, j]:+.2f})"
-            for i in range(len(names)) for j in range(i) if abs(estimate.correlation[i, j]) > _TOGETHER
-        ]  # fmt: skip
+        pairs = correlated(list(values), self.result.estimate.correlation, _TOGETHER)
         lines = []
         if vague:
             lines.append(f"The records hardly determine {', '.join(vague)}: their errors are those of the prior.")
         if pairs:
-            lines.append(f"Correlated, so that only combinations are determined: {', '.join(pairs)}.")
+            named = ", ".join(f"{a} and {b} ({c:+.2f})" for a, b, c in pairs)
+            lines.append(f"Correlated, so that only combinations are determined: {named}.")
         apart = {name: np.ptp([own[name] for own in self.members.values()]) / abs(values[name]) for name in ("kt", "R")}
         lines.append(
             f"kt and R depend on the friction law: without one group of records kt changes by"
@@ -100,14 +100,8 @@ class ServoFit:
     def to_dict(self) -> dict[str, object]:
         """Everything except the samples, in types of JSON."""
         numbers = {name: float(x) for name, x in scene_numbers(self.model).items()}
-        return jsonable(
-            {
-                "kind": _KIND, "law": self.law, "numbers": numbers, "members": self.members,
-                "left_out": self.left_out, "fitted": self.fitted, "band": self.band, "evaluations": self.evaluations,
-                "prior": self.prior, "from_duty": self.from_duty,
-                "fit": None if self.result is None else self.result.to_dict(),
-            }
-        )  # fmt: skip
+        fit = None if self.result is None else self.result.to_dict()
+        return jsonable({"kind": _KIND, "numbers": numbers, "fit": fit, **{x: getattr(self, x) for x in _SAVED}})
 
     @staticmethod
     def load(path: str | PathLike[str]) -> "ServoFit":
@@ -127,9 +121,9 @@ class ServoFit:
         numbers = body["numbers"]
         model = Servo.start(body["law"], numbers["inertia"], numbers["gravity"])
         model = replace_numbers(model, {name: on_device(np.asarray(x, float)) for name, x in numbers.items()})
-        names = ("law", "members", "left_out", "fitted", "band", "evaluations", "from_duty")
-        prior = {name: (float(mean), float(deviation)) for name, (mean, deviation) in body["prior"].items()}
-        return ServoFit(model=model, prior=prior, **{name: body[name] for name in names})
+        saved = {name: body[name] for name in _SAVED}
+        saved["prior"] = {name: (float(mean), float(deviation)) for name, (mean, deviation) in saved["prior"].items()}
+        return ServoFit(model=model, **saved)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -294,6 +294,23 @@ def _floored_root(matrix: Float[np.ndarray, "n n"], least: float) -> Float[np.nd
     return vectors / np.sqrt(np.maximum(values, least * max(values[-1], 1.0))) / scale[:, None]
 
 
+def in_unit_columns(
+    jacobian: Float[np.ndarray, "rows n"],
+) -> tuple[Float[np.ndarray, "rows n"], Float[np.ndarray, " n"]]:
+    """A Jacobian with columns of unit length, and their lengths; a column of zeros stays, and has the length 1."""
+    size = np.linalg.norm(jacobian, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    return jacobian / size, size
+
+
+def correlated(
+    names: Sequence[str], correlation: Float[np.ndarray, "free free"], least: float
+) -> list[tuple[str, str, float]]:
+    """Pairs of names whose correlation exceeds `least` in size, in the order of the names, with the correlation."""
+    places = np.argwhere(np.abs(np.tril(correlation, -1)) > least).tolist()
+    return [(names[j], names[i], float(correlation[i, j])) for i, j in places]
+
+
 def correlation_of(covariance: Float[np.ndarray, "free free"]) -> Float[np.ndarray, "free free"]:
     """Correlation of estimates by their covariance; 0 with undetermined ones."""
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
@@ -337,10 +354,8 @@ def covariance_of(
         unknown, none = np.diag(np.full(len(entries), np.inf)), np.zeros((len(entries), len(entries)))
         return CovarianceEstimate(unknown, unknown, none, refused=True)
     numbers, count = sample_blocks(problem, blocks)
-    rows, size = problem.samples, len(problem.free.names)
+    rows, slopes = problem.samples, problem.slopes_at(state.x)
     residual, jacobian = (each[:rows] for each in weighted_by(problem.loss, state))
-    slopes = np.eye(state.x.shape[0])
-    slopes[:size, :size] = problem.at(state.x).slopes
     white = _passes_for_white(problem, residual)
     extra = np.asarray(state.jacobian)[rows:]
     order = np.array([*entries, *(k for k in range(slopes.shape[0]) if k not in set(entries))])
@@ -350,15 +365,13 @@ def covariance_of(
 
 def natural_scales(problem: FitProblem, state: SearchState, entries: Sequence[int]) -> Float[np.ndarray, " entries"]:
     """Changes of the parameters `entries` that move the output by as much as the samples scatter; 0 without effect."""
-    size = len(problem.free.names)
-    slopes = np.diag(problem.at(state.x).slopes)
     jacobian = np.asarray(state.jacobian, float)[: problem.samples]
     scatter = []
     for name, weight in problem.runs.weight.items():
         x = np.asarray(problem.runs.measured[name])[np.asarray(weight) > 0]
         scatter.append(x.size * (np.std(x) / float(problem.noise[name])) ** 2 if x.size else 0.0)
-    moved = np.linalg.norm(jacobian[:, list(entries)], axis=0)
-    moved = moved / np.array([abs(slopes[k]) if k < size else 1.0 for k in entries])
+    slopes = np.abs(np.diag(problem.slopes_at(state.x)))[list(entries)]
+    moved = np.linalg.norm(jacobian[:, list(entries)], axis=0) / slopes
     return np.where(moved > 0, np.sqrt(sum(scatter)) / np.where(moved > 0, moved, 1.0), 0.0)
 
 
@@ -376,10 +389,8 @@ def offsets_left(
     """
     if problem.loss.robust:
         return {}
-    rows, x = problem.samples, np.asarray(state.x)
-    residual, jacobian = np.asarray(state.residual, float), np.asarray(state.jacobian, float)
-    size = np.linalg.norm(jacobian, axis=0)
-    scaled = jacobian / np.where(size > 0, size, 1.0)
+    rows, residual = problem.samples, np.asarray(state.residual, float)
+    scaled, size = in_unit_columns(np.asarray(state.jacobian, float))
     numbers, count = sample_blocks(problem)
     offsets = {}
     for channel in problem.runs.weight:
@@ -396,9 +407,7 @@ def offsets_left(
             left[:rows], wide[:rows], wide[rows:], np.eye(wide.shape[1]), numbers, count, 1, False
         )
         error = math.sqrt(estimate.covariance[0, 0])
-        slopes = np.eye(len(x))
-        slopes[: len(problem.free.names), : len(problem.free.names)] = problem.at(x).slopes
-        moved = slopes @ (offset * taken / np.where(size > 0, size, 1.0))
+        moved = problem.slopes_at(state.x) @ (offset * taken / size)
         far = np.abs(moved[list(entries)]) > errors
         if abs(offset) > _BEYOND * error and far.any():
             # The model lacks the offset of the sensor.

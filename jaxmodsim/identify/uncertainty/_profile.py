@@ -12,7 +12,7 @@ from scipy import special  # scipy.stats takes most of a second to import
 from ..._core.arguments import as_share, as_whole
 from ..._core.arrays import on_device
 from ..estimate._problem import FitProblem, Prior
-from ..estimate._search import SearchOptions, SearchResult, start_search, step, weighted_by
+from ..estimate._search import SearchOptions, SearchResult, finished, solve, weighted_by
 from ._estimate import BLOCKS, ROUNDING, ParameterEstimate, floored_inverse
 from ._fit import searched_on
 from ._result import FitResult
@@ -148,16 +148,11 @@ class _Line:
         here = problem.free.at(np.clip(guess[:size], here.lower, here.upper))
         x = np.array(guess, dtype)
         x[:size] = problem.free.coordinates({**here.values, self.name: value})
-        x = on_device(x)
         rtol = min(_PRECISE * self.inflation / max(self.best, 1e-300), _LARGEST_RTOL)
-        rtol = on_device(np.asarray(rtol, dtype))
-        state = start_search(x, problem.rows)
-        for _ in range(_ITERATIONS):
-            state = step(held, state, rtol)
-            if not np.isfinite(float(state.cost)):
-                return None
-            if int(state.done):
-                break
+        try:
+            state = finished(solve(held, on_device(x), SearchOptions(rtol, _ITERATIONS))).state
+        except RuntimeError:
+            return None
         cost = self.cost(np.asarray(state.residual), value)
         return _Point(u, np.asarray(state.x), 2 * (cost - self.best) / self.inflation, cost)
 
@@ -256,10 +251,9 @@ def _along(result: FitResult, name: str, points: int, level: float, least: float
 def _line_of(estimate: ParameterEstimate, search: SearchResult, name: str) -> tuple[_Line, np.ndarray]:
     """The line, and the derivative of the best x by the parameter in the linear model."""
     problem, state = search.problem, search.state
-    i, size = problem.free.names.index(name), len(problem.free.names)
+    i = problem.free.names.index(name)
     value, error = estimate.values[name], estimate.errors[name]
-    slopes = np.zeros(state.x.shape[0])
-    slopes[:size] = problem.at(state.x).slopes[i]
+    slopes = problem.slopes_at(state.x)[i]
     residual, jacobian = weighted_by(problem.loss, state)
     rounding = ROUNDING * float(np.finfo(jacobian.dtype).eps)
     sensitivity = floored_inverse(jacobian.astype(float).T @ jacobian, rounding) @ slopes

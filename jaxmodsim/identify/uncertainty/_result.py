@@ -21,7 +21,7 @@ from ..data._record import Record
 from ..data._signals import resolution, sample_noise
 from ..estimate._search import SearchResult, ended_by_itself
 from ..model._parameters import with_numbers
-from ._estimate import FitDiagnostics, FitProvenance, IdentifiabilityIssue, ParameterEstimate
+from ._estimate import FitDiagnostics, FitProvenance, IdentifiabilityIssue, ParameterEstimate, correlated
 from ._identifiability import sloppy_directions
 
 # Relative standard error, and correlation, from which a parameter is uncertain, in the search for a cause.
@@ -328,13 +328,7 @@ def _columns(result: FitResult, channel: str) -> list[np.ndarray]:
 
 def _alike(estimate: ParameterEstimate) -> list[tuple[str, str, float]]:
     """Pairs of parameters with a large correlation, the largest first."""
-    names, correlation = list(estimate.values), estimate.correlation
-    pairs = [
-        (names[j], names[i], float(correlation[i, j]))
-        for i in range(len(names))
-        for j in range(i)
-        if abs(correlation[i, j]) > _ALIKE
-    ]
+    pairs = correlated(list(estimate.values), estimate.correlation, _ALIKE)
     return sorted(pairs, key=lambda pair: -abs(pair[2]))
 
 
