@@ -14,6 +14,7 @@ from .._core.arguments import as_float, did_you_mean
 from .._core.readable import AbstractReadable, Table, table_of
 from ..scene import Scene, elements
 from ._equilibrium import Equilibrium
+from ._newton import Condition
 from ._orbit import PeriodicOrbit
 from ._rest import RestPoint
 from ._return_map import OrbitError, ShotOrbit
@@ -153,6 +154,15 @@ class AbstractStep(abc.ABC, Generic[SolutionT, OrbitT]):
     orbit: OrbitT
     scale: np.ndarray
     tangent: np.ndarray
+
+    def along(self, length: float) -> tuple[np.ndarray, Condition]:
+        """The unknowns at this distance along the tangent, and the condition that a solution is there."""
+        unknowns = self.shot.unknowns
+
+        def distance(shot: SolutionT) -> float:
+            return float(self.tangent @ ((shot.unknowns - unknowns) / self.scale)) - length
+
+        return unknowns + length * self.tangent * self.scale, Condition(distance, lambda _: self.tangent)
 
     @abc.abstractmethod
     def corrected(self, length: float) -> tuple[SolutionT, int]:

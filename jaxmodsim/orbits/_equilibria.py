@@ -104,13 +104,8 @@ class EquilibriumStep(AbstractStep[RestPoint, Equilibrium]):
 
     def corrected(self, length: float) -> tuple[RestPoint, int]:
         """The equilibrium at this distance along the tangent, and the number of iterations."""
-        unknowns = self.shot.unknowns
-        ahead = unknowns + length * self.tangent * self.scale
-
-        def along(point: RestPoint) -> tuple[float, np.ndarray]:
-            return float(self.tangent @ ((point.unknowns - unknowns) / self.scale)) - length, self.tangent
-
-        return solve_rest(self.problem, ahead[:-1], float(ahead[-1]), len(self.orbit.q), self.scale, along)
+        ahead, there = self.along(length)
+        return solve_rest(self.problem, ahead[:-1], float(ahead[-1]), len(self.orbit.q), self.scale, [there])
 
     def moved_to(self, shot: RestPoint) -> EquilibriumStep:
         """The step that begins at an equilibrium, with the tangent in the same sense."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -23,11 +24,21 @@ _TANGENT = 1e-8
 class Condition:
     """An additional equation, one for each parameter that is an unknown.
 
-    - `residual`: its value at a shot. `by`: its derivatives by the unknowns in their scales.
+    - `residual`: its value at a solution. `by`: its derivatives by the unknowns in their scales.
     """
 
-    residual: Callable[[ShotOrbit], float]
-    by: Callable[[ShotOrbit], np.ndarray]
+    residual: Callable[[Any], float]
+    by: Callable[[Any], np.ndarray]
+
+
+def all_residuals(point: Any, scale: np.ndarray, conditions: Sequence[Condition]) -> np.ndarray:
+    """Residuals of the equations in their scales, and of the conditions."""
+    return np.append(point.scaled(scale)[1], [each.residual(point) for each in conditions])
+
+
+def all_derivatives(point: Any, scale: np.ndarray, conditions: Sequence[Condition]) -> np.ndarray:
+    """Derivatives of `all_residuals` by the scaled unknowns."""
+    return np.vstack([point.scaled(scale)[0], *(each.by(point) for each in conditions)])
 
 
 def newton(
@@ -96,15 +107,11 @@ def _refuse_tangent(point: ShotOrbit, scale: np.ndarray) -> None:
 
 def _size(point: ShotOrbit, scale: np.ndarray, conditions: Sequence[Condition]) -> float:
     """Largest residual, in the scales."""
-    size = float(np.max(np.abs(point.scaled(scale)[1])))
-    return max([size, *(abs(each.residual(point)) for each in conditions)])
+    return float(np.max(np.abs(all_residuals(point, scale, conditions))))
 
 
 def _step(point: ShotOrbit, scale: np.ndarray, conditions: Sequence[Condition]) -> np.ndarray:
-    by, residual = point.scaled(scale)
-    if conditions:
-        by = np.vstack([by, *(each.by(point) for each in conditions)])
-        residual = np.append(residual, [each.residual(point) for each in conditions])
+    by, residual = (of(point, scale, conditions) for of in (all_derivatives, all_residuals))
     step = -np.linalg.lstsq(by[:, : len(by)], residual, rcond=_RANK)[0]
     return scale * np.append(step, np.zeros(len(scale) - len(step)))
 

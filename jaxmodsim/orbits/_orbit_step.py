@@ -60,13 +60,9 @@ class OrbitStep(AbstractStep[ShotOrbit, PeriodicOrbit]):
 
     def corrected(self, length: float) -> tuple[ShotOrbit, int]:
         """The orbit at this distance along the tangent, and the number of iterations."""
-        unknowns = self.shot.unknowns
-        x, period, values = split(unknowns + length * self.tangent * self.scale, self.shot, self.problem.autonomous)
-
-        def along(shot: ShotOrbit) -> float:
-            return float(self.tangent @ ((shot.unknowns - unknowns) / self.scale)) - length
-
-        conditions = [Condition(along, lambda _: self.tangent)]
+        unknowns, there = self.along(length)
+        x, period, values = split(unknowns, self.shot, self.problem.autonomous)
+        conditions = [there]
         if self.critical is not None:
             conditions.append(critical_condition(self.problem, self.critical, self.scale, len(self.orbit.q)))
         return newton(self.problem, x, period, values, len(self.orbit.q), self.scale, conditions)

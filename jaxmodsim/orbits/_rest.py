@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from ..mechanics import errors, rates
 from ..scene import Scene, State, from_dynamics, replace_elements
+from ._newton import Condition, all_derivatives, all_residuals
 from ._return_map import OrbitError, pack, unpack
 
 _ITERATIONS, _HALVINGS = 50, 8
@@ -148,14 +149,10 @@ def rest_at(problem: RestProblem, x: np.ndarray, value: float, dof: int, t: floa
     return RestPoint(x, value, residual, by)
 
 
-# Residual and derivatives of an additional equation at a point.
-_Extra = Callable[[RestPoint], tuple[float, np.ndarray]]
-
-
 def solve_rest(
-    problem: RestProblem, x: np.ndarray, value: float, dof: int, scale: np.ndarray, extra: _Extra | None = None
+    problem: RestProblem, x: np.ndarray, value: float, dof: int, scale: np.ndarray, conditions: Sequence[Condition] = ()
 ) -> tuple[RestPoint, int]:
-    """Solve the equations. With `extra` the parameter is an unknown. Returns the number of iterations too.
+    """Solve the equations. With a condition the parameter is an unknown. Returns the number of iterations too.
 
     **Raises:**
 
@@ -163,18 +160,18 @@ def solve_rest(
     """
     point, last = rest_at(problem, x, value, dof), np.inf
     for i in range(_ITERATIONS):
-        step = _step(point, scale, extra)
+        step = _step(point, scale, conditions)
         size = float(np.max(np.abs(step / scale)))
         if size < _GOAL or (size < _ENOUGH and size > 0.5 * last):
             _refuse_other_modes(problem, point, dof)
             return point, i
-        before, last = _size(point, scale, extra), size
+        before, last = _size(point, scale, conditions), size
         start = point.unknowns
         for halving in range(_HALVINGS):
             unknowns = start + step * 0.5**halving
             unknowns[dof : 2 * dof] = 0.0  # exact zeros, because modes depend on them
             point = rest_at(problem, unknowns[:-1], float(unknowns[-1]), dof)
-            if size < _ENOUGH or _size(point, scale, extra) < before:
+            if size < _ENOUGH or _size(point, scale, conditions) < before:
                 break
     raise OrbitError(
         f"No convergence to an equilibrium in {_ITERATIONS} iterations: the last relative step is {last:.3g}. Begin"
@@ -182,26 +179,21 @@ def solve_rest(
     )
 
 
-def _size(point: RestPoint, scale: np.ndarray, extra: _Extra | None) -> float:
-    more = 0.0 if extra is None else extra(point)[0]
-    return float(np.linalg.norm([*point.scaled(scale)[1], more]))
+def _size(point: RestPoint, scale: np.ndarray, conditions: Sequence[Condition]) -> float:
+    return float(np.linalg.norm(all_residuals(point, scale, conditions)))
 
 
-def _step(point: RestPoint, scale: np.ndarray, extra: _Extra | None) -> np.ndarray:
-    by, residual = point.scaled(scale)
-    if extra is None:
-        by = by[:, :-1]
-    else:
-        more, row = extra(point)
-        by, residual = np.vstack([by, row]), np.append(residual, more)
+def _step(point: RestPoint, scale: np.ndarray, conditions: Sequence[Condition]) -> np.ndarray:
+    by, residual = (of(point, scale, conditions) for of in (all_derivatives, all_residuals))
+    by = by if conditions else by[:, :-1]
     step, _, rank, _ = np.linalg.lstsq(by, -residual, rcond=_RANK)
-    if extra is None and rank < by.shape[1] and np.max(np.abs(residual)) < _ENOUGH:
+    if not conditions and rank < by.shape[1] and np.max(np.abs(residual)) < _ENOUGH:
         raise OrbitError(
             "The equilibrium is one of a family: the scene does not determine its place. Examples are a coordinate"
             " without a spring, and a bristle at rest, as of LuGre on a surface at rest. Give the surface a velocity,"
             " or use a set-valued law, whose set of equilibria has ends."
         )
-    return scale * (np.append(step, 0.0) if extra is None else step)
+    return scale * (step if conditions else np.append(step, 0.0))
 
 
 def _refuse_other_modes(problem: RestProblem, point: RestPoint, dof: int) -> None:

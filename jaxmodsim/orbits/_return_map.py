@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -131,19 +131,22 @@ def run_segment(
     max_steps: int = 16384,
 ) -> Trajectory:
     """The run from x over a segment, saved at these times [s], clipped to the segment, or at its end alone."""
-    y = unpack(scene, x, dof)
     t0, t1 = span * period
-    return simulate(
-        *(scene, y.q, y.qd, t1),
-        t0=t0,
-        z0=y.z,
-        ts=None if times is None else jnp.clip(times, t0, t1),
-        rtol=problem.rtol,
-        atol=problem.atol,
-        max_steps=max_steps,
-        max_events=MAX_EVENTS,
-        throw=False,
-    )
+    ts = None if times is None else jnp.clip(times, t0, t1)
+    return run_between(problem, scene, unpack(scene, x, dof), (t0, t1), ts, max_steps=max_steps, throw=False)
+
+
+def run_between(
+    problem: OrbitProblem,
+    scene: Scene,
+    y: State,
+    span: tuple[Array | float, Array | float],
+    ts: Array | None,
+    **options: Any,
+) -> Trajectory:
+    """The run from a state over a span of time [s], with the tolerances of the problem."""
+    options |= {"rtol": problem.rtol, "atol": problem.atol, "max_events": MAX_EVENTS}
+    return simulate(scene, y.q, y.qd, span[1], t0=span[0], z0=y.z, ts=ts, **options)
 
 
 def end_of(run: Trajectory) -> Float[Array, " n"]:

@@ -7,9 +7,9 @@ import jax.tree_util as jtu
 import numpy as np
 
 from ..scene import State
-from ..simulation import SimulationError, Trajectory, simulate
+from ..simulation import SimulationError, Trajectory
 from ._neutral import anchored, moving_on
-from ._return_map import MAX_EVENTS, MAX_STEPS, OrbitError, OrbitProblem, Section, SettledState
+from ._return_map import MAX_STEPS, OrbitError, OrbitProblem, Section, SettledState, run_between
 
 # Number of saved times of a run.
 _TIMES = 4001
@@ -28,16 +28,7 @@ _LAST = 0.5
 def run_for(problem: OrbitProblem, state: State, t0: float, ts: np.ndarray) -> Trajectory:
     """A run of the scene from t0 to the last of the times `ts`."""
     try:
-        return simulate(
-            *(problem.scene, state.q, state.qd, ts[-1]),
-            t0=t0,
-            z0=state.z,
-            ts=jnp.asarray(ts),
-            rtol=problem.rtol,
-            atol=problem.atol,
-            max_steps=MAX_STEPS,
-            max_events=MAX_EVENTS,
-        )
+        return run_between(problem, problem.scene, state, (t0, ts[-1]), jnp.asarray(ts), max_steps=MAX_STEPS)
     except SimulationError as error:
         raise OrbitError(f"The run over one period, or until it settles, failed: {error}") from error
 
