@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,12 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _KIND, _VERSION = "jaxmodsim work precision", 4
+# Titles of columns that are not the name of the field, and the fields that are no columns of their own, or the last.
+_TITLES = {
+    "dt": "dt [s]", "numerical": "numerical error", "model": "model error", "events": "event error [s]",
+    "gradient": "gradient error",
+}  # fmt: skip
+_AFTER = ("failed", "times", "warnings")
 
 
 @dataclass(frozen=True)
@@ -213,24 +219,10 @@ def _cell(row: Row, head: str, floors: dict[str, float], costs: Sequence[str]) -
 
 def _columns(row: Row, costs: Sequence[str]) -> dict[str, object]:
     """The columns of a row."""
-    columns: dict[str, object] = {
-        "method": row.method,
-        "rtol": row.rtol,
-        "dt [s]": row.dt,
-        "dtype": row.dtype,
-        "error": row.error,
-        "numerical error": row.numerical,
-        "model error": row.model,
-        "event error [s]": row.events,
-        "gradient error": row.gradient,
-        "steps": row.steps,
-        "rejected": row.rejected,
-        "evaluations": row.evaluations,
-    }
+    columns = {_TITLES.get(name, name): x for name, x in vars(row).items() if name not in _AFTER}
     for cost in costs:
         timing = (row.times or {}).get(cost)
-        for name in ("compile", "median", "low", "high"):
-            columns[f"{cost} {name} [s]"] = None if timing is None else getattr(timing, name)
+        columns |= {f"{cost} {each.name} [s]": getattr(timing, each.name, None) for each in fields(Timing)}
     return {**columns, "failed": row.failed}
 
 

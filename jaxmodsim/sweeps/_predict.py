@@ -1,6 +1,7 @@
 """Prediction of the number of steps of each run of a sweep, from a trial of a few runs."""
 
 from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement
 from math import comb
 
 import numpy as np
@@ -93,8 +94,5 @@ def _columns(numbers: dict[str, np.ndarray], names: tuple[str, ...], logs: tuple
 
 def _products(x: np.ndarray, degree: int) -> np.ndarray:
     """All products of up to `degree` columns."""
-    parts, last = [np.ones((x.shape[0], 1))], [(np.ones(x.shape[0]), 0)]
-    for _ in range(degree):
-        last = [(product * x[:, i], i) for product, first in last for i in range(first, x.shape[1])]
-        parts += [product[:, None] for product, _ in last]
-    return np.concatenate(parts, axis=1)
+    chosen = [each for k in range(degree + 1) for each in combinations_with_replacement(range(x.shape[1]), k)]
+    return np.stack([np.prod(x[:, each], axis=1) for each in chosen], axis=1)
