@@ -336,15 +336,11 @@ def _read_fields(path: str | PathLike[str], wanted: list[str]) -> dict[str, Any]
     """The saved fields of a result by name, with the errors of `FitResult.load`."""
     content = io.BytesIO(Path(path).read_bytes())
     try:
-        with zipfile.ZipFile(content) as archive:
-            if _TEXT not in archive.namelist():
+        with np.load(content, allow_pickle=False) as archive:
+            if _TEXT not in archive.files:
                 raise ValueError(f"it holds no {_TEXT}")
-            text = json.loads(archive.read(_TEXT))
-            arrays = {
-                name.removesuffix(".npy"): np.lib.format.read_array(io.BytesIO(archive.read(name)), allow_pickle=False)
-                for name in archive.namelist()
-                if name.endswith(".npy")
-            }
+            text = json.loads(archive[_TEXT])
+            arrays = {name: archive[name] for name in archive.files if name != _TEXT}
     except Exception as error:  # damaged bytes can raise anything
         raise ValueError(f"{path} was not written by FitResult.save, or it is damaged: {error}") from error
     if not isinstance(text, dict) or text.get("kind") != _KIND:
