@@ -24,10 +24,10 @@ FILES = sorted(ROOT.rglob("*.py"))
 CORE = {"_core": 3285, "mechanics": 1610, "friction": 2993, "scene": 3800, "solvers": 4045, "simulation": 3192}
 APPLICATIONS = {
     "metrics": 650,
-    "analysis": 2150,
-    "orbits": 3143,
-    "identify": 9754,
-    "sweeps": 2136,
+    "analysis": 2142,
+    "orbits": 3137,
+    "identify": 9681,
+    "sweeps": 2134,
     "export": 2100,
     "control": 800,
     "problems": 2900,
