@@ -6,23 +6,19 @@ from collections.abc import Sequence
 from typing import NamedTuple
 from xml.etree import ElementTree as et
 
-# Units in base units of FMI: a factor, and exponents.
-_BASE: dict[str, tuple[float, dict[str, int]]] = {
-    "m": (1.0, {"m": 1}),
-    "rad": (1.0, {"rad": 1}),
-    "s": (1.0, {"s": 1}),
-    "kg": (1.0, {"kg": 1}),
-    "A": (1.0, {"A": 1}),
-    "K": (1.0, {"K": 1}),
-    "N": (1.0, {"kg": 1, "m": 1, "s": -2}),
-    "J": (1.0, {"kg": 1, "m": 2, "s": -2}),
-    "W": (1.0, {"kg": 1, "m": 2, "s": -3}),
-    "Pa": (1.0, {"kg": 1, "m": -1, "s": -2}),
-    "Hz": (1.0, {"s": -1}),
-    "V": (1.0, {"kg": 1, "m": 2, "s": -3, "A": -1}),
-    "1": (1.0, {}),
-    "-": (1.0, {}),
+# Exponents of units in base units of FMI.
+_BASE: dict[str, dict[str, int]] = {
+    **{base: {base: 1} for base in ("m", "rad", "s", "kg", "A", "K")},
+    "N": {"kg": 1, "m": 1, "s": -2},
+    "J": {"kg": 1, "m": 2, "s": -2},
+    "W": {"kg": 1, "m": 2, "s": -3},
+    "Pa": {"kg": 1, "m": -1, "s": -2},
+    "Hz": {"s": -1},
+    "V": {"kg": 1, "m": 2, "s": -3, "A": -1},
+    "1": {},
+    "-": {},
 }
+# Factor and unit of other units.
 _DERIVED = {"km": (1e3, "m"), "cm": (1e-2, "m"), "mm": (1e-3, "m"), "um": (1e-6, "m"), "nm": (1e-9, "m")}
 _DERIVED |= {"in": (0.0254, "m"), "ft": (0.3048, "m"), "mrad": (1e-3, "rad"), "urad": (1e-6, "rad")}
 _DERIVED |= {"deg": (math.pi / 180, "rad"), "rev": (2 * math.pi, "rad"), "ms": (1e-3, "s"), "us": (1e-6, "s")}
@@ -62,8 +58,8 @@ def base_unit(text: str) -> tuple[float, dict[str, int]] | None:
         scale, symbol = _DERIVED.get(symbol, (1.0, symbol))
         if symbol not in _BASE:
             return None
-        factor *= (scale * _BASE[symbol][0]) ** (sign * power)
-        for base, each in _BASE[symbol][1].items():
+        factor *= scale ** (sign * power)
+        for base, each in _BASE[symbol].items():
             exponents[base] = exponents.get(base, 0) + sign * power * each
     return factor, {base: each for base, each in exponents.items() if each}
 
