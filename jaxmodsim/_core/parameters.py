@@ -227,7 +227,7 @@ def optional_parameter(
     name: str, unit: str, *, lower: float | str | None = None, strict: bool = False, most: float | None = None
 ) -> Any:
     """A `parameter` with the default None."""
-    convert = partial(_unless_none, convert=as_number, name=name)
+    convert = partial(unless_none, convert=as_number, name=name)
     return eqx.field(default=None, converter=convert, metadata={"range": Range(unit, lower, strict, most=most)})
 
 
@@ -238,7 +238,7 @@ def vector_parameter(name: str, unit: str, *, lower: float | str | None = None, 
 
 def optional_vector_parameter(name: str, unit: str, *, lower: float | str | None = None) -> Any:
     """A `vector_parameter` with the default None."""
-    convert = partial(_unless_none, convert=as_vector, name=name)
+    convert = partial(unless_none, convert=as_vector, name=name)
     return eqx.field(default=None, converter=convert, metadata={"range": Range(unit, lower)})
 
 
@@ -257,7 +257,8 @@ def _of_state(value: Any, *, name: str) -> object:
     return number
 
 
-def _unless_none(value: object, *, convert: Callable[..., object], name: str) -> object:
+def unless_none(value: object, *, convert: Callable[..., Any], name: str) -> Any:
+    """The converted value, or None."""
     return None if value is None else convert(value, name=name)
 
 
@@ -291,6 +292,13 @@ def check_ranges(module: eqx.Module) -> None:
     values = {name: nominal(getattr(module, name)) for name in ranges_of(module)}
     for name, allowed in ranges_of(module).items():
         allowed.check(values[name], name=f"{type(module).__name__}: {name}", others=values)
+
+
+class AbstractRanged(eqx.Module):
+    """A module that refuses parameters out of range."""
+
+    def __check_init__(self) -> None:
+        check_ranges(self)
 
 
 def modules_of(tree: object, path: str = "") -> Iterator[tuple[str, eqx.Module]]:

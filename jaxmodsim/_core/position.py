@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .functions import as_function, real_array
-from .parameters import Range, as_number, as_real
+from .parameters import Range, as_number, as_real, unless_none
 
 
 class PositionFn(eqx.Module):
@@ -45,6 +46,11 @@ def as_position_fn(value: Any, *, name: str) -> PositionFn:
     if len(needed) > 2:
         raise ValueError(f"{name} must be a function of q, or of q and params, but it takes {len(needed)} arguments.")
     return PositionFn(function, len(needed) == 2, name)
+
+
+def optional_position(name: str) -> Any:
+    """Field for a function of `q`, or of `q` and `params`; None by default."""
+    return eqx.field(default=None, converter=partial(unless_none, convert=as_position_fn, name=name))
 
 
 class ScalarOrFn(eqx.Module):

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from .._core.arrays import PerDof, Scalar
 from .._core.functions import bind_state, is_state_dependent, nominal
-from .._core.parameters import check_ranges, ranges_of
+from .._core.parameters import AbstractRanged, ranges_of
 from .._core.readable import AbstractReadable
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ class Passivity:
         return f"Not passive from {self.speed:g} m/s on; margin {self.margin:g} N s/m. {self.condition}"
 
 
-class AbstractLaw(AbstractReadable, eqx.Module):
+class AbstractLaw(AbstractReadable, AbstractRanged):
     """A friction law: a function of slip velocity [m/s or rad/s] and its own state, independent of the mechanism.
 
     The class holds all information about the law; `register_law` makes it available to the command line, the benches
@@ -132,10 +132,6 @@ class AbstractLaw(AbstractReadable, eqx.Module):
     )
     example: ClassVar[Mapping[str, PyTree]] = {}
     example_step: ClassVar[float | None] = None
-
-    def __check_init__(self) -> None:
-        """Refuse parameters out of range."""
-        check_ranges(self)
 
     def bind_state(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> "AbstractLaw":
         """The law with its parameters at a state of the mechanism; itself if none of them depends on the state."""

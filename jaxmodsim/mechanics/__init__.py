@@ -6,6 +6,7 @@ from ._charts import Chart as Chart
 from ._charts import Cylindrical as Cylindrical
 from ._charts import Spherical as Spherical
 from ._constraints import AbstractConstraint as AbstractConstraint
+from ._constraints import AbstractEquations as AbstractEquations
 from ._constraints import Constraint as Constraint
 from ._constraints import LinearizedConstraints as LinearizedConstraints
 from ._constraints import VelocityConstraint as VelocityConstraint

@@ -21,32 +21,20 @@ from .._core.arguments import as_label
 from .._core.arrays import PerDof, Scalar, apply_matrix
 from .._core.cholesky import factor_positive_definite, solve_balanced
 from .._core.functions import as_function, result_shape
-from .._core.parameters import Number, check_ranges, parameter
-from .._core.position import PositionFn, as_position_fn
+from .._core.parameters import AbstractRanged, Number, parameter
+from .._core.position import PositionFn, optional_position
 from .._core.safe import safe_norm
 from .._core.trace_checks import traced
 
 
-def as_at(value: Any) -> PositionFn | None:
-    """The position function of a constraint, or None."""
-    return None if value is None else as_position_fn(value, name="Constraint at")
-
-
-class AbstractConstraint(eqx.Module):
+class AbstractEquations(eqx.Module):
     """One or several equations of the motion, each with a multiplier."""
 
-    # Name of the constraint in the results and for friction; None for the default name.
     if TYPE_CHECKING:
-        name = cast("str | None", None)  # not a field, which would come before those of the constraints
-        stabilise = cast("Array", None)
+        stabilise = cast("Array", None)  # not a field, which would come before those of the constraints
     else:
-        name: AbstractVar[str | None]
         # Rate [1/s] at which errors decay.
         stabilise: AbstractVar[Number]
-
-    def __check_init__(self) -> None:
-        """Refuse numbers out of range."""
-        check_ranges(self)
 
     @abc.abstractmethod
     def error(self, t: Scalar, q: PerDof, params: PyTree) -> Float[Array, " m"] | None:
@@ -55,6 +43,16 @@ class AbstractConstraint(eqx.Module):
     @abc.abstractmethod
     def rate(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Float[Array, " m"]:
         """Residual of the velocity, shape `[m]`."""
+
+
+class AbstractConstraint(AbstractEquations, AbstractRanged):
+    """Equations of the motion that a scene has as a part, with their force."""
+
+    # Name of the constraint in the results and for friction; None for the default name.
+    if TYPE_CHECKING:
+        name = cast("str | None", None)
+    else:
+        name: AbstractVar[str | None]
 
     @abc.abstractmethod
     def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
@@ -160,7 +158,7 @@ class Constraint(AbstractPositionConstraint):
     """
 
     phi: Callable[..., Any] = eqx.field(converter=partial(as_function, name="Constraint phi"))
-    at: PositionFn | None = eqx.field(default=None, converter=as_at)
+    at: PositionFn | None = optional_position("Constraint at")
     stabilise: Number = parameter("stabilise", "1/s", lower=0.0, default=0.0)
     name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="Constraint name"))
 
@@ -239,7 +237,7 @@ def _check_vector(role: str, fn: Callable[..., Any], **args: Any) -> None:
 # Newton steps of a projection: each squares the error of an integration step.
 _NEWTON = 2
 
-Constraints = Sequence[AbstractConstraint]
+Constraints = Sequence[AbstractEquations]
 
 
 class LinearizedConstraints(NamedTuple):

@@ -13,16 +13,16 @@ from jaxtyping import Array, Float, PyTree
 from .._core.arguments import as_label
 from .._core.arrays import PerDof, Scalar, is_known
 from .._core.functions import as_function
-from .._core.parameters import Default, Number, Range, check_ranges, parameter, parameter_or
-from .._core.position import PositionFn, ScalarOrFn, as_position_fn, as_scalar_or_fn
+from .._core.parameters import AbstractRanged, Default, Number, Range, parameter, parameter_or
+from .._core.position import PositionFn, ScalarOrFn, as_position_fn, as_scalar_or_fn, optional_position
 from .._core.safe import safe_power
-from ._constraints import AbstractConstraint, AbstractPositionConstraint, as_at
+from ._constraints import AbstractEquations, AbstractPositionConstraint
 
 # Newton steps to the speed after an impact; at low speed each of the first steps only halves the error.
 _NEWTON = 60
 
 
-class Poisson(eqx.Module):
+class Poisson(AbstractRanged):
     """Poisson's law of impact: a contact returns at least the fraction `e` of its compression impulse in expansion.
 
     The compression impulses are those of an impact without restitution. Each expansion impulse is at least `e` times
@@ -64,12 +64,8 @@ class Poisson(eqx.Module):
 
     e: Number = parameter("e", "", lower=0.0, upper=1.0)
 
-    def __check_init__(self) -> None:
-        """Refuse a coefficient out of range."""
-        check_ranges(self)
 
-
-class HuntCrossley(eqx.Module):
+class HuntCrossley(AbstractRanged):
     """A compliant contact with the force `k d^n (1 + 3/2 damping d')` at the penetration d > 0, but never a pull.
 
     The contact has no impacts and no modes. A body that strikes at the speed v leaves at `restitution(v) v`, where the
@@ -112,10 +108,6 @@ class HuntCrossley(eqx.Module):
     stiffness: Number = parameter("stiffness", "N/m^n", lower=0.0, strict=True)
     exponent: Number = parameter("exponent", "", lower=1.0, default=1.5)
     damping: Number = parameter("damping", "s/m", lower=0.0, default=0.0)
-
-    def __check_init__(self) -> None:
-        """Refuse numbers out of range."""
-        check_ranges(self)
 
     def force(self, depth: Scalar, rate: Scalar) -> Scalar:
         """Force [N] at the penetration `depth` [m] and its rate [m/s]; zero if the contact is open."""
@@ -202,7 +194,7 @@ class Contact(AbstractPositionConstraint):
     restitution: Number | Poisson | HuntCrossley = parameter_or(
         "restitution", "", (Poisson, HuntCrossley), lower=0.0, upper=1.0, default=0.0
     )
-    at: PositionFn | None = eqx.field(default=None, converter=as_at)
+    at: PositionFn | None = optional_position("Constraint at")
     name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="Contact name"))
 
     stabilise: ClassVar[float] = 0.0
@@ -240,17 +232,12 @@ class Contact(AbstractPositionConstraint):
             )
 
 
-class BoundContact(AbstractConstraint):
-    """A contact in a mode: a constraint if `closed` is 1, without effect if it is 0."""
+class BoundContact(AbstractEquations):
+    """A contact in a mode: an equation if `closed` is 1, without effect if it is 0."""
 
     contact: Contact
     closed: Float[Array, ""]
     stabilise: ClassVar[float] = 0.0
-
-    @property
-    def name(self) -> str | None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Name of the contact."""
-        return self.contact.name
 
     def error(self, t: Scalar, q: PerDof, params: PyTree) -> Float[Array, "1"]:
         """The gap; zero if the contact is open."""
@@ -259,18 +246,6 @@ class BoundContact(AbstractConstraint):
     def rate(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Float[Array, "1"]:
         """The velocity of the gap; zero if the contact is open."""
         return self.closed * self.contact.rate(t, q, qd, params)
-
-    def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
-        """Check the contact."""
-        self.contact.check(q, qd, params, name)
-
-    def force(self, t: Scalar, q: PerDof, params: PyTree, multiplier: Float[Array, "1"]) -> Float[Array, "..."] | None:
-        """Force of the contact; the multiplier is zero if the contact is open."""
-        return self.contact.force(t, q, params, multiplier)
-
-    def per_multiplier(self, t: Scalar, q: PerDof, params: PyTree) -> Scalar:
-        """Magnitude of the contact's force for a multiplier of one."""
-        return self.contact.per_multiplier(t, q, params)
 
 
 _NO_BOUNCE = Default(0.0)

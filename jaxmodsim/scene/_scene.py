@@ -17,7 +17,7 @@ from .._core.functions import as_function
 from .._core.parameters import as_real, is_weak
 from .._core.readable import AbstractReadable
 from ..friction import AbstractLaw
-from ..mechanics import AbstractConstraint, BoundContact, Contact, Lagrangian, Poisson
+from ..mechanics import AbstractConstraint, AbstractEquations, BoundContact, Contact, Lagrangian, Poisson
 from ._coordinates import as_coordinates, read_label
 from ._signal import Signal, signals_at, signals_from, signals_of
 from .forces._effect import AbstractEffect
@@ -341,7 +341,7 @@ class Scene(AbstractReadable, eqx.Module):
         lagrangian = _Driven(self.lagrangian, driven) if signals_of(driven) else self.lagrangian
         return dataclasses.replace(self, lagrangian=lagrangian, params=signals_at(driven, t))
 
-    def constraints_in(self, mode: Array | None) -> tuple[AbstractConstraint, ...]:
+    def constraints_in(self, mode: Array | None) -> tuple[AbstractEquations, ...]:
         """The constraints with each contact bound to its mode; `mode` holds the modes of `mode_names`.
 
         **Raises:**

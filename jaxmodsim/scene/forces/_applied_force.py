@@ -12,12 +12,8 @@ from jaxtyping import PyTree
 from ..._core.arguments import as_label
 from ..._core.arrays import PerDof, Scalar
 from ..._core.functions import as_function, result_shape
-from ..._core.position import PositionFn, as_position_fn
-from ._effect import AbstractEffect, Action, Power
-
-
-def _at(value: Any) -> PositionFn | None:
-    return None if value is None else as_position_fn(value, name="AppliedForce at")
+from ..._core.position import PositionFn, optional_position
+from ._effect import AbstractEffect, Action
 
 
 class AppliedForce(AbstractEffect):
@@ -50,18 +46,13 @@ class AppliedForce(AbstractEffect):
     """
 
     fn: Callable[..., Any] = eqx.field(converter=partial(as_function, name="AppliedForce fn"))
-    at: PositionFn | None = eqx.field(default=None, converter=_at)
+    at: PositionFn | None = optional_position("AppliedForce at")
     name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="AppliedForce name"))
 
     @property
     def default_name(self) -> str:
         """Name in the results."""
         return "applied"
-
-    @property
-    def stiff(self) -> bool:
-        """Applied forces count as smooth."""
-        return False
 
     def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
         """Check the shape that `fn` returns."""
@@ -76,10 +67,6 @@ class AppliedForce(AbstractEffect):
                 " Return jnp.array([...]) with one entry for each."
             )
 
-    def initial_state(self, q: PerDof, params: PyTree) -> PyTree:
-        """An applied force has no state."""
-        return None
-
     def act(self, t: Scalar, q: PerDof, qd: PerDof, z: PyTree, params: PyTree) -> Action:
         """The force, and the generalised force that it makes."""
         force = jnp.asarray(self.fn(t, q, qd, params), q.dtype)
@@ -88,11 +75,3 @@ class AppliedForce(AbstractEffect):
             return Action(force, force)
         _, pull = jax.vjp(lambda q: at(q, params), q)
         return Action(pull(force)[0], force)
-
-    def power(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree, action: Action) -> Power:
-        """All power comes from outside."""
-        return Power(jnp.sum(action.generalised * qd))
-
-    def stored_energy(self, z: PyTree) -> float:
-        """An applied force stores no energy."""
-        return 0.0

@@ -4,6 +4,7 @@ import abc
 from typing import TYPE_CHECKING, NamedTuple, cast
 
 import equinox as eqx
+import jax.numpy as jnp
 from equinox import AbstractVar
 from jaxtyping import Array, Float, PyTree
 
@@ -36,7 +37,8 @@ class Power(NamedTuple):
 class AbstractEffect(eqx.Module):
     """A force on the mechanism, with or without a state of its own.
 
-    A subclass has the field `name` and the methods below; its numbers are fields, too.
+    A subclass has the field `name` and the method `act`; its numbers are fields, too. The other methods have defaults:
+    an effect that is not stiff, has no state, and supplies all its power from outside.
 
     **Example:**
 
@@ -44,14 +46,6 @@ class AbstractEffect(eqx.Module):
     class Drag(jms.AbstractEffect):
         c: float  # N s^2/m^2
         name: str | None = None
-        default_name = "drag"
-        stiff = False
-
-        def check(self, q, qd, params, name):
-            pass
-
-        def initial_state(self, q, params):
-            return None
 
         def act(self, t, q, qd, z, params):
             force = self.c * jnp.abs(qd) * qd
@@ -59,9 +53,6 @@ class AbstractEffect(eqx.Module):
 
         def power(self, t, q, qd, params, action):
             return jms.scene.Power(0.0 * t, jnp.sum(action.force * qd))
-
-        def stored_energy(self, z):
-            return 0.0
 
     scene = jms.Scene(lambda t, q, qd, p: 0.5 * qd[0] ** 2, {}, (Drag(c=1.0),))
     print(f"{jms.simulate(scene, [0.0], [1.0], 1.0).qd[-1, 0]:.4f} m/s")  # 1/(1 + c t)
@@ -72,7 +63,7 @@ class AbstractEffect(eqx.Module):
     ```
     """
 
-    # Name of the effect in the results; None for that of the class.
+    # Name of the effect in the results; None for `default_name`.
     if TYPE_CHECKING:
         name = cast("str | None", None)  # not a field, which would come before those of the effects
     else:
@@ -83,31 +74,31 @@ class AbstractEffect(eqx.Module):
         return self
 
     @property
-    @abc.abstractmethod
     def default_name(self) -> str:
-        """Name in the results without a name from the user."""
+        """Name in the results without a name from the user; by default that of the class in lower case."""
+        return type(self).__name__.lower()
 
     @property
-    @abc.abstractmethod
     def stiff(self) -> bool:
         """Whether the effect makes the equations of motion stiff."""
+        return False
 
-    @abc.abstractmethod
     def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
         """Check shapes against the mechanism while tracing; raises `ValueError` naming the effect."""
+        return
 
-    @abc.abstractmethod
     def initial_state(self, q: PerDof, params: PyTree) -> PyTree:
         """State at rest and unloaded, at the coordinates `q`; None for an effect without one."""
+        return None
 
     @abc.abstractmethod
     def act(self, t: Scalar, q: PerDof, qd: PerDof, z: PyTree, params: PyTree) -> Action:
         """Forces, and the rate of the effect's state `z`."""
 
-    @abc.abstractmethod
     def power(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree, action: Action) -> Power:
-        """Power of an action of this effect."""
+        """Power of an action of this effect; by default all of it comes from outside."""
+        return Power(jnp.sum(action.generalised * qd))
 
-    @abc.abstractmethod
     def stored_energy(self, z: PyTree) -> Scalar | float:
         """Energy [J] in the effect's state."""
+        return 0.0

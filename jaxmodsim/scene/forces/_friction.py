@@ -14,8 +14,8 @@ from jaxtyping import Array, Float, PyTree
 from ..._core.arguments import as_label
 from ..._core.arrays import PerDof, Scalar, is_known
 from ..._core.functions import StateDependent, as_function, depends_on, is_state_dependent, result_shape
-from ..._core.parameters import Default, Number, Range, as_number, check_ranges, modules_of, optional_parameter
-from ..._core.position import PositionFn, as_position_fn
+from ..._core.parameters import AbstractRanged, Default, Number, Range, as_number, modules_of, optional_parameter
+from ..._core.position import PositionFn, optional_position
 from ..._core.safe import safe_norm
 from ..._core.trace_checks import traced
 from ...friction import (
@@ -47,10 +47,6 @@ def _law(law: Any) -> AbstractLaw:
     )
 
 
-def _along(value: Any) -> PositionFn | None:
-    return None if value is None else as_position_fn(value, name="Friction along")
-
-
 def _belt(value: Any) -> Any:
     if callable(value):
         return as_function(value, name="Friction belt_velocity")
@@ -78,7 +74,7 @@ def _role(x: StateDependent) -> str:
     return "the torque" if x.number is None else "scaled_by's fn"
 
 
-class Friction(AbstractEffect):
+class Friction(AbstractEffect, AbstractRanged):
     """A friction law acting along a displacement of the mechanism.
 
     The slip velocity is `v = d/dt along(q) - belt_velocity`, and the friction force F, positive when it opposes
@@ -130,7 +126,7 @@ class Friction(AbstractEffect):
     """
 
     law: AbstractLaw = eqx.field(converter=_law)
-    along: PositionFn | None = eqx.field(default=None, converter=_along)
+    along: PositionFn | None = optional_position("Friction along")
     belt_velocity: Number | Callable[..., Any] = eqx.field(
         default=Default(0.0), converter=_belt, metadata={"range": Range("")}
     )
@@ -140,20 +136,11 @@ class Friction(AbstractEffect):
     name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="Friction name"))
     ellipse: Number | None = optional_parameter("ellipse", "1", lower=0.0, strict=True)
 
-    def __check_init__(self) -> None:
-        """Refuse numbers out of range."""
-        check_ranges(self)
-
     def bind_state(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> "Friction":
         """The element with its law at this state; itself if the law does not depend on the state."""
         if not is_state_dependent(self.law):
             return self
         return eqx.tree_at(lambda x: x.law, self, self.law.bind_state(t, q, qd, params))
-
-    @property
-    def default_name(self) -> str:
-        """Name in the results."""
-        return "friction"
 
     @property
     def stiff(self) -> bool:

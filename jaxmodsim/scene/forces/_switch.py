@@ -11,11 +11,12 @@ from jaxtyping import PyTree
 from ..._core.arguments import as_label
 from ..._core.arrays import PerDof, Scalar
 from ..._core.functions import as_function, result_shape
-from ._effect import AbstractEffect, Action, Power
+from ..._core.parameters import unless_none
+from ._effect import AbstractEffect, Action
 
 
-def _force(value: object, *, name: str) -> Callable[..., Any] | None:
-    return None if value is None else as_function(value, name=name)
+def _optional_force(name: str) -> Any:
+    return eqx.field(default=None, converter=partial(unless_none, convert=as_function, name=name))
 
 
 class Switch(AbstractEffect):
@@ -52,19 +53,9 @@ class Switch(AbstractEffect):
     """
 
     guard: Callable[..., Any] = eqx.field(converter=partial(as_function, name="Switch guard"))
-    above: Callable[..., Any] | None = eqx.field(default=None, converter=partial(_force, name="Switch above"))
-    below: Callable[..., Any] | None = eqx.field(default=None, converter=partial(_force, name="Switch below"))
+    above: Callable[..., Any] | None = _optional_force("Switch above")
+    below: Callable[..., Any] | None = _optional_force("Switch below")
     name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="Switch name"))
-
-    @property
-    def default_name(self) -> str:
-        """Name in the results."""
-        return "switch"
-
-    @property
-    def stiff(self) -> bool:
-        """Forces count as smooth on either side."""
-        return False
 
     def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
         """Check the shapes that the functions return."""
@@ -80,10 +71,6 @@ class Switch(AbstractEffect):
                     f"Switch {name!r}: {role} returned the shape {given}, but {wanted} is needed: "
                     + ("one number." if role == "guard" else "one entry for each coordinate.")
                 )
-
-    def initial_state(self, q: PerDof, params: PyTree) -> PyTree:
-        """A switch has a mode, but no state."""
-        return None
 
     def act(self, t: Scalar, q: PerDof, qd: PerDof, z: PyTree, params: PyTree) -> Action:
         """An error: the force depends on the mode."""
@@ -105,11 +92,3 @@ class Switch(AbstractEffect):
     def value(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Scalar:
         """The guard, as a number of the type of `q`."""
         return jnp.asarray(self.guard(t, q, qd, params), q.dtype)
-
-    def power(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree, action: Action) -> Power:
-        """All power comes from outside."""
-        return Power(jnp.sum(action.generalised * qd))
-
-    def stored_energy(self, z: PyTree) -> float:
-        """A switch stores no energy."""
-        return 0.0
