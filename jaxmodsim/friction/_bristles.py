@@ -1,5 +1,6 @@
 """Laws with a bristle, an elastic element that follows slip and yields, and functions of such elements."""
 
+import abc
 import math
 from collections.abc import Mapping
 from functools import partial
@@ -8,6 +9,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from equinox import AbstractVar
 from jaxtyping import Array, Float, PyTree
 
 from .._core.arrays import Scalar
@@ -111,8 +113,36 @@ def bristle_passivity(self: PyTree) -> Passivity:
     return Passivity(margin >= 0, margin, speed, condition)
 
 
+class AbstractLinearBristle(AbstractPlanarLaw):
+    """A bristle z with `z' = v - sigma0 |v| z/g(v)`, which is linear in z, and the elastic force `sigma0 z`."""
+
+    sigma0: AbstractVar[Number]
+    stiff: ClassVar[bool] = True
+    limitations: ClassVar[Mapping[str, str]] = _ONE_STATE | _YIELDS
+
+    @abc.abstractmethod
+    def stribeck_curve(self, v: Float[Array, "..."]) -> Scalar:
+        """g(v) [N], the bristle force in steady slip at `v` [m/s]."""
+
+    def initial_state(self, v: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Undeflected bristle, 0 m."""
+        return jnp.zeros_like(v)
+
+    def zdot(self, v: Float[Array, "..."], z: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Rate of z [m/s] at slip velocity `v` [m/s] and deflection `z` [m]."""
+        return v - self.sigma0 * magnitude(v) / self.stribeck_curve(v) * z
+
+    def stored_energy(self, z: Float[Array, "..."]) -> Scalar:
+        """Elastic energy [J] of the bristle."""
+        return 0.5 * self.sigma0 * jnp.sum(z * z)
+
+    def step_exact(self, v: Float[Array, "..."], z: Float[Array, "..."], dt: Scalar) -> Float[Array, "..."]:
+        """Exact deflection [m] after `dt` [s] at constant `v` [m/s], since the rate is linear in z."""
+        return relax_exact(v, z, dt, self.sigma0 * magnitude(v) / self.stribeck_curve(v))
+
+
 @register_law
-class Dahl(AbstractPlanarLaw):
+class Dahl(AbstractLinearBristle):
     """The Dahl law: a force that grows with displacement, like stress with strain, up to the Coulomb force.
 
     `z' = v - sigma0 |v| z/Fc`, `F = sigma0 z`: a function of displacement, independent of speed. In cycles between +-A
@@ -153,32 +183,18 @@ class Dahl(AbstractPlanarLaw):
 
     sigma0: Number = parameter("sigma0", "N/m", lower=0.0, strict=True)
     Fc: Number = parameter("Fc", "N", lower=0.0, strict=True)
-    stiff: ClassVar[bool] = True
     description: ClassVar[str] = "force grows with displacement up to `Fc`"
     equations: ClassVar[tuple[str, ...]] = ("sigma0 z", "z' = v - sigma0 |v| z/Fc")
-    limitations: ClassVar[Mapping[str, str]] = _ONE_STATE | _YIELDS
 
-    def initial_state(self, v: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Undeflected bristle, 0 m."""
-        return jnp.zeros_like(v)
-
-    def zdot(self, v: Float[Array, "..."], z: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Rate of z [m/s] at slip velocity `v` [m/s] and deflection `z` [m]."""
-        return v - self.sigma0 * magnitude(v) / self.Fc * z
+    def stribeck_curve(self, v: Float[Array, "..."]) -> Scalar:
+        """Fc [N] at any velocity."""
+        return self.Fc
 
     def force_given_zdot(
         self, v: Float[Array, "..."], z: Float[Array, "..."], rate: Float[Array, "..."]
     ) -> Float[Array, "..."]:
         """Friction force [N] at deflection `z` [m]."""
         return self.sigma0 * z
-
-    def stored_energy(self, z: Float[Array, "..."]) -> Scalar:
-        """Elastic energy [J]."""
-        return 0.5 * self.sigma0 * jnp.sum(z * z)
-
-    def step_exact(self, v: Float[Array, "..."], z: Float[Array, "..."], dt: Scalar) -> Float[Array, "..."]:
-        """Exact deflection [m] after `dt` [s] at constant `v` [m/s]."""
-        return relax_exact(v, z, dt, self.sigma0 * magnitude(v) / self.Fc)
 
     def passivity(self) -> Passivity:
         """Always passive: with the bristle force `Fc u` the dissipation is `|v| Fc u^2`."""
@@ -195,7 +211,7 @@ _BREAK_AWAY_TIME, _DAMPING, _BREAK_AWAY, _FALL = 2e-3, 0.1, 1.1, 0.05
 
 
 @register_law
-class LuGre(AbstractPlanarLaw):
+class LuGre(AbstractLinearBristle):
     """The LuGre law: an elastic bristle of mean deflection z [m] that yields as the surfaces slip.
 
     `z' = v - sigma0 |v| z / g(v)`, `F = sigma0 z + sigma1 z' + sigma2 v`, `g(v) = Fc + (Fs - Fc) exp(-(v/vs)^2)`. At
@@ -251,14 +267,12 @@ class LuGre(AbstractPlanarLaw):
     Fs: Number = parameter("Fs", "N", lower="Fc", most=MOST_STICTION)
     vs: Number = parameter("vs", "m/s", lower=0.0, strict=True)
     vd: Number | None = optional_parameter("vd", "m/s", lower=0.0, strict=True)
-    stiff: ClassVar[bool] = True
     description: ClassVar[str] = "bristle with a Stribeck effect; with `vd` its damping fades with speed"
     equations: ClassVar[tuple[str, ...]] = (
         "sigma0 z + sigma1 z' + sigma2 v",
         "z' = v - sigma0 |v| z/g(v)",
         STRIBECK_CURVE,
     )
-    limitations: ClassVar[Mapping[str, str]] = _ONE_STATE | _YIELDS
     mujoco_lacks: ClassVar[str] = (
         " whose sigma1 fades (vd): leave vd out, and check the result with check_passivity(law)"
     )
@@ -267,14 +281,6 @@ class LuGre(AbstractPlanarLaw):
     def stribeck_curve(self, v: Float[Array, "..."]) -> Scalar:
         """g(v) [N], the bristle force in steady slip at `v` [m/s]."""
         return stribeck_curve(magnitude(v), self.Fc, self.Fs, self.vs)
-
-    def initial_state(self, v: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Undeflected bristle, 0 m."""
-        return jnp.zeros_like(v)
-
-    def zdot(self, v: Float[Array, "..."], z: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Rate of z [m/s] at slip velocity `v` [m/s] and deflection `z` [m]."""
-        return v - self.sigma0 * magnitude(v) / self.stribeck_curve(v) * z
 
     def force_given_zdot(
         self, v: Float[Array, "..."], z: Float[Array, "..."], rate: Float[Array, "..."]
@@ -285,14 +291,6 @@ class LuGre(AbstractPlanarLaw):
             ratio = bounded_ratio(magnitude(v), self.vd)
             sigma1 = sigma1 * jnp.exp(-ratio * ratio)
         return self.sigma0 * z + sigma1 * rate + self.sigma2 * v
-
-    def stored_energy(self, z: Float[Array, "..."]) -> Scalar:
-        """Elastic energy [J] of the bristle."""
-        return 0.5 * self.sigma0 * jnp.sum(z * z)
-
-    def step_exact(self, v: Float[Array, "..."], z: Float[Array, "..."], dt: Scalar) -> Float[Array, "..."]:
-        """Exact deflection [m] after `dt` [s] at constant `v` [m/s], since the rate is linear in z."""
-        return relax_exact(v, z, dt, self.sigma0 * magnitude(v) / self.stribeck_curve(v))
 
     def mujoco(self) -> dict[str, PyTree] | str:
         """A motor of MuJoCo has the bristle with a constant sigma1."""
