@@ -140,15 +140,27 @@ def solve_semidefinite(
     scale = jnp.max(scaled)
     scale = jnp.where(scale > 0, scale, 1.0)
     scaled, right = scaled / scale, jnp.where(each(active), each(weight) * rhs, 0.0) / scale
+    solution = solve_shifted(scaled, right, active, factor_positive_definite)
+    return jnp.where(each(active), each(weight) * solution, 0.0)
+
+
+def solve_shifted(
+    matrix: Float[Array, "n n"],
+    rhs: Float[Array, "n *k"],
+    active: Bool[Array, " n"],
+    factor: Callable[[Array], Callable[[Array], Array]],
+) -> Float[Array, "n *k"]:
+    """Solve a system that may be singular, with a largest entry of one; `factor` returns the solver of a matrix.
+
+    Rows and columns that are not `active` are zero.
+    """
     # A shift keeps the factors of redundant rows finite, and selects the solution of least norm. Refinement removes its
     # error, down to rounding if the rows are not redundant.
     shift = float(jnp.finfo(rhs.dtype).eps) ** 0.5
-    shifted = scaled + jnp.eye(n, dtype=rhs.dtype) * jnp.where(active, shift, 1.0)[None, :]
-    solve = factor_positive_definite(shifted)
-    solution = solve(right)
+    solve = factor(matrix + jnp.eye(rhs.shape[0], dtype=rhs.dtype) * jnp.where(active, shift, 1.0)[None, :])
+    solution = solve(rhs)
     for _ in range(_REFINEMENTS):
-        solution = solution + solve(right - apply_matrix(scaled, solution))
+        solution = solution + solve(rhs - apply_matrix(matrix, solution))
     # In the null space of the matrix the solution contains rounding divided by the shift. Two more solves isolate that
     # part: they scale the other components by (shift/eigenvalue)^2.
-    solution = solution - shift**2 * solve(solve(solution))
-    return jnp.where(each(active), each(weight) * solution, 0.0)
+    return solution - shift**2 * solve(solve(solution))

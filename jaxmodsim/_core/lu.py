@@ -98,6 +98,12 @@ def factor_lu(rows: Sequence[Sequence[Scalar]], *, pivot: bool) -> LinearSolver:
     return lambda rhs: _solve(shape, unknown, unknown_factors, list(swaps.values()), list(rhs))
 
 
+def factor_matrix(matrix: Float[Array, "n n"]) -> Callable[[Array], Array]:
+    """`factor_lu` with swaps of rows, for a matrix and right-hand sides that are arrays."""
+    solve = factor_lu([list(jnp.unstack(row)) for row in jnp.unstack(matrix)], pivot=True)
+    return lambda rhs: jnp.stack(solve(list(jnp.unstack(rhs))))
+
+
 def invert(matrix: Float[Array, "n n"], *, pivot: bool) -> Callable[[Array], Array]:
     """Solver of a system that is too large for scalars, by the inverse, in a loop of rank-one updates.
 

@@ -15,7 +15,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from .arrays import apply_matrix
-from .lu import MAX_UNROLLED_LU, factor_lu, invert
+from .lu import MAX_UNROLLED_LU, factor_matrix, invert
 
 # Largest numbers of evaluations in one line search, and of Newton steps for several unknowns.
 _MOST_EVALUATIONS = 200
@@ -177,10 +177,8 @@ def _newton(coupling: Array, slopes: Array, residual: Array) -> Array:
         slope = 1.0 + coupling[0, 0] * slopes[0, 0]
         return -residual / jnp.where(slope > 0, slope, 1.0)
     matrix = jnp.eye(n, dtype=residual.dtype) + jnp.sum(coupling[:, :, None] * slopes[None, :, :], axis=1)
-    if n > MAX_UNROLLED_LU:
-        return -invert(matrix, pivot=True)(residual)
-    solve = factor_lu([[matrix[i, j] for j in range(n)] for i in range(n)], pivot=True)
-    return -jnp.stack(solve([residual[i] for i in range(n)]))
+    solve = invert(matrix, pivot=True) if n > MAX_UNROLLED_LU else factor_matrix(matrix)
+    return -solve(residual)
 
 
 def _solve_one(fn: Callable[[Array], Array], free: Array, coupling: Array, blocks: tuple[int, ...]) -> Monotone:

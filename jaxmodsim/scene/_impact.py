@@ -18,15 +18,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._core.arrays import PerDof, Scalar
-from .._core.cholesky import factor_positive_definite, solve_semidefinite
-from .._core.lu import factor_lu
+from .._core.cholesky import factor_positive_definite, solve_semidefinite, solve_shifted
+from .._core.lu import factor_matrix
 from ..mechanics import LinearizedConstraints, Poisson, linearize_constraints, motion_equations
 from ._scene import Scene
 
 # A gap or a slip has no velocity below this number of rounding units of the velocities of all coordinates.
 _ROUNDING = 64.0
-# Refinement steps for systems that may be singular, as in `solve_semidefinite`.
-_REFINEMENTS = 2
 
 _constant = jax.lax.stop_gradient
 
@@ -185,29 +183,12 @@ def _solve(
     spread = jnp.eye(n + m, dtype=v.dtype).at[n:, :n].set(share)
     both = free[:, None] & free[None, :]
     matrix = jnp.where(both, jnp.sum(a[:, :, None] * spread[None, :, :], axis=1), 0.0)
-    solution = _solve_singular(matrix, jnp.where(free, rhs, 0.0), free)
-    return given + jnp.sum(spread * solution[None, :], axis=1)
-
-
-def _solve_singular(
-    matrix: Float[Array, "k k"], rhs: Float[Array, " k"], free: Bool[Array, " k"]
-) -> Float[Array, " k"]:
-    """As `solve_semidefinite`, for a matrix that friction makes unsymmetric."""
-    k = rhs.shape[0]
     scale = jnp.max(jnp.abs(matrix))
     scale = jnp.where(scale > 0, scale, 1.0)
-    matrix, rhs = matrix / scale, rhs / scale
-    shift = float(jnp.finfo(rhs.dtype).eps) ** 0.5
-    shifted = matrix + jnp.eye(k, dtype=rhs.dtype) * jnp.where(free, shift, 1.0)[None, :]
-    factored = factor_lu([list(row) for row in shifted], pivot=True)
-
-    def solve(x: Array) -> Array:
-        return jnp.stack(factored(list(x)))
-
-    solution = solve(rhs)
-    for _ in range(_REFINEMENTS):
-        solution = solution + solve(rhs - jnp.sum(matrix * solution[None, :], axis=1))
-    return jnp.where(free, solution - shift**2 * solve(solve(solution)), 0.0)
+    # As `solve_semidefinite`, for a matrix that friction makes unsymmetric.
+    solution = solve_shifted(matrix / scale, jnp.where(free, rhs, 0.0) / scale, free, factor_matrix)
+    solution = jnp.where(free, solution, 0.0)
+    return given + jnp.sum(spread * solution[None, :], axis=1)
 
 
 def _violation(
