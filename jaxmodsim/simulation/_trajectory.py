@@ -204,7 +204,7 @@ class Trajectory(AbstractReadable):
         `AppliedForce` the value of its function, shape `[time, ...]`.
         """
         self._one_run("forces")
-        forces = _forces(self.scene, self.t, self._states(), self.modes)
+        forces = _along(_forces, self.scene, self.t, self._states(), self.modes)
         # Compiled functions return them sorted by name.
         return ByName({name: forces[name] for name in self.scene.names})
 
@@ -212,7 +212,7 @@ class Trajectory(AbstractReadable):
     def reactions(self) -> dict[str, ConstraintReaction]:
         """Forces of each constraint along the run, by name: multipliers, generalised and Cartesian force."""
         self._one_run("reactions")
-        reactions = _reactions(self.scene, self.t, self._states(), self.modes)
+        reactions = _along(_reactions, self.scene, self.t, self._states(), self.modes)
         return ByName({name: reactions[name] for name in self.scene.constraint_names})
 
     @property
@@ -278,7 +278,7 @@ class Trajectory(AbstractReadable):
     def momentum(self) -> Float[Array, "*time dof"]:
         """Canonical momenta dL/dqd along the run, shape `[time, dof]` [kg m/s or kg m^2/s]."""
         self._one_run("momentum")
-        return _momentum(self.scene, self.t, self.q, self.qd)
+        return _along(_momentum, self.scene, self.t, self._states(), self.modes)
 
     @property
     def ledger(self) -> EnergyLedger:
@@ -440,41 +440,34 @@ def trajectory(request: RunRequest, solved: RunOutput) -> Trajectory:
     return Trajectory(*motion, solved.stats, solved.code, end, request, solved.log, solved.work)
 
 
-@jax.jit
 def _forces(scene: Scene, t: Array, y: State, mode: Array | None) -> dict[str, Array]:
-    return _reached(t, jax.vmap(lambda t, y, mode: forward_dynamics(t, y, scene, mode).forces)(t, y, mode))
+    return forward_dynamics(t, y, scene, mode).forces
 
 
-@jax.jit
 def _reactions(scene: Scene, t: Array, y: State, mode: Array | None) -> dict[str, ConstraintReaction]:
-    return _reached(t, jax.vmap(lambda t, y, mode: forward_dynamics(t, y, scene, mode).reactions)(t, y, mode))
+    return forward_dynamics(t, y, scene, mode).reactions
 
 
-@jax.jit
-def _momentum(scene: Scene, t: Array, q: Array, qd: Array) -> Array:
-    def at(t: Array, q: Array, qd: Array) -> Array:
-        now = scene.bind_time(t)
-        return momentum(now.lagrangian, t, q, qd, now.params)
+def _momentum(scene: Scene, t: Array, y: State, mode: Array | None) -> Array:
+    del mode
+    now = scene.bind_time(t)
+    return momentum(now.lagrangian, t, y.q, y.qd, now.params)
 
-    return _reached(t, jax.vmap(at)(t, q, qd))
+
+@partial(jax.jit, static_argnums=0)
+def _along(get: Callable[..., PyTree], scene: Scene, t: Array, y: State, mode: Array | None) -> PyTree:
+    """`get(scene, t, y, mode)` at each time of a run, infinite at times after an early end."""
+    tree = jax.vmap(partial(get, scene))(t, y, mode)
+    return jtu.tree_map(lambda x: jnp.where(jnp.expand_dims(jnp.isfinite(t), range(1, x.ndim)), x, jnp.inf), tree)
 
 
 @jax.jit
 def _event_forces(scene: Scene, log: EventLog) -> dict[str, Array]:
     happened = jnp.isfinite(log.t)
     t = jnp.where(happened, log.t, 0.0)
-    sides = [
-        jax.vmap(lambda t, y, mode: forward_dynamics(t, y, scene, mode).forces)(t, *side)
-        for side in (log.before, log.after)
-    ]
+    sides = [jax.vmap(partial(_forces, scene))(t, *side) for side in (log.before, log.after)]
     both = jtu.tree_map(lambda *each: jnp.stack(each, axis=1), *sides)
     return jtu.tree_map(lambda x: jnp.where(jnp.expand_dims(happened, range(1, x.ndim)), x, jnp.nan), both)
-
-
-def _reached(t: Array, tree: PyTree) -> PyTree:
-    """Arrays along a run, infinite at times after an early end."""
-    reached = jnp.isfinite(t)
-    return jtu.tree_map(lambda x: jnp.where(jnp.expand_dims(reached, range(1, x.ndim)), x, jnp.inf), tree)
 
 
 @jax.jit
