@@ -14,7 +14,14 @@ from .._core.cholesky import factor_positive_definite
 from .._core.functions import depends_on
 from .._core.readable import short
 from .._core.scalarise import in_scalars
-from ..mechanics import Contact, LinearizedConstraints, linearize_constraints, motion_equations, parts
+from ..mechanics import (
+    AbstractEquations,
+    Contact,
+    LinearizedConstraints,
+    linearize_constraints,
+    motion_equations,
+    parts,
+)
 from ._event_driven import (
     FrictionElements,
     FrictionForces,
@@ -332,17 +339,22 @@ class Mobility(NamedTuple):
 
     def accelerate(self, force: PerDof) -> PerDof:
         """Accelerations under the generalised force `force`."""
-        free = self.solve(force)
-        return (
-            free
-            if self.constraints is None
-            else free + self.constraints.apply_force(self.constraints.multipliers(free))
-        )
+        free, held = self.solve(force), self.constraints
+        return free if held is None else free + held.apply_force(held.multipliers(free))
 
     def respond(self, force: Float[Array, "dof *k"]) -> Float[Array, "dof *k"]:
         """Change of the accelerations with the generalised force, one or several."""
         free = self.solve(force)
         return free if self.constraints is None else self.constraints.respond(free)
+
+
+def load_and_mobility(
+    scene: Scene, constraints: tuple[AbstractEquations, ...], t: Scalar, q: PerDof, qd: PerDof
+) -> tuple[PerDof, Mobility]:
+    """Load of the Lagrangian, and mobility within these constraints; the scene is that of this state."""
+    mass, load = motion_equations(scene.lagrangian, t, q, qd, scene.params)
+    held = linearize_constraints(constraints, t, q, qd, scene.params, mass) if constraints else None
+    return load, Mobility(factor_positive_definite(mass), held)
 
 
 def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> Dynamics:
@@ -355,14 +367,8 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
     q, qd = y.q, y.qd
     scene = scene.bind_state(t, q, qd)
     params = scene.params
-    equations = motion_equations(scene.lagrangian, t, q, qd, params)
-    linearized = (
-        linearize_constraints(scene.constraints_in(mode), t, q, qd, params, equations.mass)
-        if scene.constraints
-        else None
-    )
-    mobility = Mobility(factor_positive_definite(equations.mass), linearized)
-    actions, rhs = {}, equations.load
+    rhs, mobility = load_and_mobility(scene, scene.constraints_in(mode), t, q, qd)
+    linearized, actions = mobility.constraints, {}
     compliant = _compliant(scene, t, y) if scene.compliant else None
     if compliant is not None:
         rhs = rhs + compliant.generalised

@@ -9,11 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from .._core.arrays import PerDof, Scalar
-from .._core.cholesky import factor_positive_definite
 from .._core.monotone import solve_monotone
 from ..friction import Sign
-from ..mechanics import linearize_constraints, motion_equations
-from ._dynamics import Mobility, State
+from ._dynamics import State, load_and_mobility
 from ._scene import Scene
 from .forces._friction import Friction
 
@@ -86,13 +84,8 @@ def scene_step(scene: Scene, t0: Scalar, t1: Scalar, y: State) -> tuple[State, B
     q, qd, h = y.q, y.qd, t1 - t0
     scene = scene.bind_state(t0, q, qd)
     params = scene.params
-    equations = motion_equations(scene.lagrangian, t0, q, qd, params)
-    linearized = (
-        linearize_constraints(scene.constraints, t0, q, qd, params, equations.mass) if scene.constraints else None
-    )
-    mobility = Mobility(factor_positive_definite(equations.mass), linearized)
+    rhs, mobility = load_and_mobility(scene, scene.constraints, t0, q, qd)
     elements = {name: _element(effect, t0, t1, q, qd, params) for name, effect in scene.friction.items()}
-    rhs = equations.load
     for name, effect in zip(scene.names, scene.effects, strict=True):
         if name not in elements:
             rhs = rhs + effect.act(t0, q, qd, y.z.get(name), params).generalised
