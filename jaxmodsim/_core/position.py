@@ -2,7 +2,6 @@
 
 import inspect
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -10,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .functions import as_function, real_array
-from .parameters import Range, as_number, as_real, unless_none
+from .parameters import Range, as_number, as_real
 
 
 class PositionFn(eqx.Module):
@@ -48,9 +47,9 @@ def as_position_fn(value: Any, *, name: str) -> PositionFn:
     return PositionFn(function, len(needed) == 2, name)
 
 
-def optional_position(name: str) -> Any:
-    """Field for a function of `q`, or of `q` and `params`; None by default."""
-    return eqx.field(default=None, converter=partial(unless_none, convert=as_position_fn, name=name))
+def as_optional_position_fn(value: Any, *, name: str) -> PositionFn | None:
+    """As `as_position_fn`, or None."""
+    return None if value is None else as_position_fn(value, name=name)
 
 
 class ScalarOrFn(eqx.Module):

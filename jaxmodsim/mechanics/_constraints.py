@@ -22,7 +22,7 @@ from .._core.arrays import PerDof, Scalar, apply_matrix
 from .._core.cholesky import factor_positive_definite, solve_balanced
 from .._core.functions import as_function, result_shape
 from .._core.parameters import AbstractRanged, Number, parameter
-from .._core.position import PositionFn, optional_position
+from .._core.position import PositionFn, as_optional_position_fn
 from .._core.safe import safe_norm
 from .._core.trace_checks import traced
 
@@ -158,7 +158,7 @@ class Constraint(AbstractPositionConstraint):
     """
 
     phi: Callable[..., Any] = eqx.field(converter=partial(as_function, name="Constraint phi"))
-    at: PositionFn | None = optional_position("Constraint at")
+    at: PositionFn | None = eqx.field(default=None, converter=partial(as_optional_position_fn, name="Constraint at"))
     stabilise: Number = parameter("stabilise", "1/s", lower=0.0, default=0.0)
     name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="Constraint name"))
 

@@ -14,7 +14,7 @@ from .._core.arguments import as_label
 from .._core.arrays import PerDof, Scalar, is_known
 from .._core.functions import as_function
 from .._core.parameters import AbstractRanged, Default, Number, Range, parameter, parameter_or
-from .._core.position import PositionFn, ScalarOrFn, as_position_fn, as_scalar_or_fn, optional_position
+from .._core.position import PositionFn, ScalarOrFn, as_optional_position_fn, as_position_fn, as_scalar_or_fn
 from .._core.safe import safe_power
 from ._constraints import AbstractEquations, AbstractPositionConstraint
 
@@ -194,7 +194,7 @@ class Contact(AbstractPositionConstraint):
     restitution: Number | Poisson | HuntCrossley = parameter_or(
         "restitution", "", (Poisson, HuntCrossley), lower=0.0, upper=1.0, default=0.0
     )
-    at: PositionFn | None = optional_position("Constraint at")
+    at: PositionFn | None = eqx.field(default=None, converter=partial(as_optional_position_fn, name="Constraint at"))
     name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="Contact name"))
 
     stabilise: ClassVar[float] = 0.0

@@ -12,7 +12,7 @@ from jaxtyping import PyTree
 from ..._core.arguments import as_label
 from ..._core.arrays import PerDof, Scalar
 from ..._core.functions import as_function, result_shape
-from ..._core.position import PositionFn, optional_position
+from ..._core.position import PositionFn, as_optional_position_fn
 from ._effect import AbstractEffect, Action
 
 
@@ -46,7 +46,7 @@ class AppliedForce(AbstractEffect):
     """
 
     fn: Callable[..., Any] = eqx.field(converter=partial(as_function, name="AppliedForce fn"))
-    at: PositionFn | None = optional_position("AppliedForce at")
+    at: PositionFn | None = eqx.field(default=None, converter=partial(as_optional_position_fn, name="AppliedForce at"))
     name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="AppliedForce name"))
 
     @property

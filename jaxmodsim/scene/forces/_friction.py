@@ -15,7 +15,7 @@ from ..._core.arguments import as_label
 from ..._core.arrays import PerDof, Scalar, is_known
 from ..._core.functions import StateDependent, as_function, depends_on, is_state_dependent, result_shape
 from ..._core.parameters import AbstractRanged, Default, Number, Range, as_number, modules_of, optional_parameter
-from ..._core.position import PositionFn, optional_position
+from ..._core.position import PositionFn, as_optional_position_fn
 from ..._core.safe import safe_norm
 from ..._core.trace_checks import traced
 from ...friction import (
@@ -126,7 +126,9 @@ class Friction(AbstractEffect, AbstractRanged):
     """
 
     law: AbstractLaw = eqx.field(converter=_law)
-    along: PositionFn | None = optional_position("Friction along")
+    along: PositionFn | None = eqx.field(
+        default=None, converter=partial(as_optional_position_fn, name="Friction along")
+    )
     belt_velocity: Number | Callable[..., Any] = eqx.field(
         default=Default(0.0), converter=_belt, metadata={"range": Range("")}
     )

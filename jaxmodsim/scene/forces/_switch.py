@@ -11,12 +11,11 @@ from jaxtyping import PyTree
 from ..._core.arguments import as_label
 from ..._core.arrays import PerDof, Scalar
 from ..._core.functions import as_function, result_shape
-from ..._core.parameters import unless_none
 from ._effect import AbstractEffect, Action
 
 
-def _optional_force(name: str) -> Any:
-    return eqx.field(default=None, converter=partial(unless_none, convert=as_function, name=name))
+def _force(value: object, *, name: str) -> Callable[..., Any] | None:
+    return None if value is None else as_function(value, name=name)
 
 
 class Switch(AbstractEffect):
@@ -53,8 +52,8 @@ class Switch(AbstractEffect):
     """
 
     guard: Callable[..., Any] = eqx.field(converter=partial(as_function, name="Switch guard"))
-    above: Callable[..., Any] | None = _optional_force("Switch above")
-    below: Callable[..., Any] | None = _optional_force("Switch below")
+    above: Callable[..., Any] | None = eqx.field(default=None, converter=partial(_force, name="Switch above"))
+    below: Callable[..., Any] | None = eqx.field(default=None, converter=partial(_force, name="Switch below"))
     name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="Switch name"))
 
     def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
