@@ -227,7 +227,7 @@ def optional_parameter(
     name: str, unit: str, *, lower: float | str | None = None, strict: bool = False, most: float | None = None
 ) -> Any:
     """A `parameter` with the default None."""
-    convert = partial(_unless_none, convert=as_number, name=name)
+    convert = partial(unless_none, convert=as_number, name=name)
     return eqx.field(default=None, converter=convert, metadata={"range": Range(unit, lower, strict, most=most)})
 
 
@@ -238,7 +238,7 @@ def vector_parameter(name: str, unit: str, *, lower: float | str | None = None, 
 
 def optional_vector_parameter(name: str, unit: str, *, lower: float | str | None = None) -> Any:
     """A `vector_parameter` with the default None."""
-    convert = partial(_unless_none, convert=as_vector, name=name)
+    convert = partial(unless_none, convert=as_vector, name=name)
     return eqx.field(default=None, converter=convert, metadata={"range": Range(unit, lower)})
 
 
@@ -257,7 +257,8 @@ def _of_state(value: Any, *, name: str) -> object:
     return number
 
 
-def _unless_none(value: object, *, convert: Callable[..., Any], name: str) -> object:
+def unless_none(value: Any, *, convert: Callable[..., Any], name: str) -> Any:
+    """`convert(value, name=name)`, or None for None."""
     return None if value is None else convert(value, name=name)
 
 

@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .functions import as_function, real_array
-from .parameters import Range, as_number, as_real
+from .parameters import Range, as_number, as_real, unless_none
 
 
 class PositionFn(eqx.Module):
@@ -47,9 +48,7 @@ def as_position_fn(value: Any, *, name: str) -> PositionFn:
     return PositionFn(function, len(needed) == 2, name)
 
 
-def as_optional_position_fn(value: Any, *, name: str) -> PositionFn | None:
-    """As `as_position_fn`, or None."""
-    return None if value is None else as_position_fn(value, name=name)
+as_optional_position_fn = partial(unless_none, convert=as_position_fn)
 
 
 class ScalarOrFn(eqx.Module):

@@ -15,12 +15,11 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _KIND, _VERSION = "jaxmodsim work precision", 4
-# Titles of columns that are not the name of the field, and the fields that are no columns of their own, or the last.
+# Titles of columns that are not the name of the field.
 _TITLES = {
     "dt": "dt [s]", "numerical": "numerical error", "model": "model error", "events": "event error [s]",
     "gradient": "gradient error",
 }  # fmt: skip
-_AFTER = ("failed", "times", "warnings")
 
 
 @dataclass(frozen=True)
@@ -218,8 +217,9 @@ def _cell(row: Row, head: str, floors: dict[str, float], costs: Sequence[str]) -
 
 
 def _columns(row: Row, costs: Sequence[str]) -> dict[str, object]:
-    """The columns of a row."""
-    columns = {_TITLES.get(name, name): x for name, x in vars(row).items() if name not in _AFTER}
+    """The columns of a row, the last of which is `failed`."""
+    others = ("failed", "times", "warnings")
+    columns = {_TITLES.get(name, name): x for name, x in vars(row).items() if name not in others}
     for cost in costs:
         timing = (row.times or {}).get(cost)
         columns |= {f"{cost} {each.name} [s]": getattr(timing, each.name, None) for each in fields(Timing)}

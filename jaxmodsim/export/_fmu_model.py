@@ -130,7 +130,8 @@ class Model(NamedTuple):
         self, t: Array, p: Scene, tol: Array, fired: Array, dense: Array, y: State, m: Array
     ) -> tuple[State, Array]:
         """State and modes after the guards that `fired`; `dense`: whether impacts accumulate."""
-        return switch(t, y, p, m, fired > 0, tol[0], dense > 0, False)
+        y, m, touching = switch(t, y, p, m, fired > 0, tol[0], dense > 0, False)
+        return self.on_constraints(t, p, y, touching) if p.contacts else y, m
 
 
 def series_of(model: Model) -> dict[str, tuple[int, ...]]:

@@ -205,7 +205,7 @@ class Dynamics(NamedTuple):
             wide = jnp.concatenate([each.error(*at) for each in contacts])
             rounding = jnp.stack([each.rounding(*at) for each in contacts])
             guards.append(jnp.where(gaps > 0, self.contact_forces, wide + rounding))
-            atol.append(jnp.where(gaps > 0, 0.0, tolerances[1]))
+            atol.append(jnp.where(gaps > 0, 0.0, tolerances[1] + rounding))
             roots.append(jnp.where(gaps > 0, 0.0, rounding))
         if sides.size:
             switches = self.scene.switches.values()
@@ -278,10 +278,10 @@ class Dynamics(NamedTuple):
 
     def _release(self, mode: Float[Array, " n"]) -> Float[Array, " n"]:
         """Modes in which no element sticks under an open contact: stick would hold it in derivatives."""
-        contacts = dict(zip(self.scene.contacts, self._modes[1], strict=True))
         loads = [each.load_constraint for each in self.scene.event_driven.values()]
-        if not any(load in contacts for load in loads):
+        if not any(load in self.scene.contacts for load in loads):
             return mode
+        contacts = dict(zip(self.scene.contacts, jnp.where(self.pulls, 0.0, self._modes[1]), strict=True))
         elements, closed = self.friction_elements, jnp.ones_like(self.t)
         free = jnp.stack([contacts.get(load or "", closed) == 0 for load in loads])
         v = jax.lax.stop_gradient(elements.v[: mode.size])
@@ -315,6 +315,11 @@ class Dynamics(NamedTuple):
         assert self.multipliers is not None
         pushes = by_constraint(self.scene, self.t, self.y, self.multipliers)
         return jnp.concatenate([pushes[name] for name in self.scene.contacts])
+
+    @property
+    def pulls(self) -> Bool[Array, " n"]:
+        """Which contacts are closed and would pull."""
+        return (self._modes[1] > 0) & (self.contact_forces < 0)
 
     @property
     def stick_violation(self) -> Float[Array, " n"]:
@@ -407,13 +412,15 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
         return Dynamics(t, y, mode, scene, actions, moves, None, None, reported, multipliers, None)
 
     qdd, minv_jt = moves[:, 0], moves[:, 1:].T
-    along, loads, least_mobility = jnp.concatenate(directions), None, None
+    along, loads, rounding = jnp.concatenate(directions), None, None
     if multipliers is not None and yields is not None:
-        least_mobility = _ROUNDING * float(jnp.finfo(q.dtype).eps) * jnp.sum(along.T * free[:, 1:], axis=0)
+        unit = _ROUNDING * float(jnp.finfo(q.dtype).eps)
+        rate = unit * jnp.sum(jnp.abs(along * free[None, :, 0]), axis=1) if scene.contacts else None
+        rounding = unit * jnp.sum(along.T * free[:, 1:], axis=0), rate
         if scene.loaded:
             loads = _loads(scene, t, y, [len(each) for each in directions], multipliers, yields)
     modes = jnp.zeros(0, q.dtype) if mode is None else scene.split_modes(mode)[0]
-    elements = assemble_friction(friction, along, minv_jt, least_mobility, loads, t, q, qd, params, qdd, modes)
+    elements = assemble_friction(friction, along, minv_jt, rounding, loads, t, q, qd, params, qdd, modes)
     solved = solve_friction_forces(elements, modes)
     forces = [solved.force[part] for part in elements.parts]
     for force, (name, effect) in zip(forces, scene.event_driven.items(), strict=False):

@@ -191,7 +191,7 @@ def assemble_friction(
     friction: list[Friction],
     along: Float[Array, "n dof"],
     minv_jt: Float[Array, "n dof"],
-    least_mobility: Float[Array, " n"] | None,
+    rounding: tuple[Float[Array, " n"], Float[Array, " n"] | None] | None,
     loads: Loads | None,
     t: Scalar,
     q: PerDof,
@@ -208,8 +208,8 @@ def assemble_friction(
     - `along`: directions of their rows; then, for each element without a mode, which a reaction loads, the generalised
       force that it takes away per newton of load.
     - `minv_jt`: accelerations within the constraints by these generalised forces.
-    - `least_mobility`: the least mobility [1/kg] of each row above rounding; None without constraints, where nothing
-      cancels.
+    - `rounding`: that of the mobility [1/kg] of each row, with contacts also of its slip acceleration [m/s^2]; None
+      without constraints, where nothing cancels.
     - `loads`: normal forces that are reactions.
     - `t`, `q`, `qd`, `params`: the state.
     - `mode`: modes, from which planes take their reference velocities.
@@ -233,12 +233,18 @@ def assemble_friction(
         rows += [(v[i], rate[i], zero, zero, upper, lower, force[i], onset) for i in range(v.shape[0])]
     rows += [(zero, zero, one, one, one, one, zero, zero)] * (along.shape[0] - len(rows))
     delassus = jnp.sum(along[:, None, :] * minv_jt[None], axis=2)
-    if least_mobility is not None:
-        # Where constraints leave a direction no mobility (a slider at its dead centre), no force holds it. Rounding may
-        # leave a mobility of zero or less, which would look as if no force were needed.
-        delassus = delassus + jnp.diag(least_mobility)
     columns = [*zip(*rows, strict=True)]
     v, rate, *forces = (jnp.stack(column) for column in columns[:6])
+    if rounding is not None:
+        # Where constraints leave a direction no mobility (a slider at its dead centre), no force holds it. Rounding may
+        # leave a mobility of zero or less, which would look as if no force were needed.
+        if rounding[1] is not None:
+            # A stop holds its mass without friction: a force within the limits is rounding over rounding.
+            still = jnp.abs(rate) <= rounding[1] + rounding[0] * jnp.minimum(*forces[2:])
+            held = still & (jnp.diagonal(delassus) <= rounding[0])
+            rate = jnp.where(held, 0.0, rate)
+            delassus = jnp.where(held[:, None] | held[None, :], 0.0, delassus)
+        delassus = delassus + jnp.diag(rounding[0])
     planar = PlanarSlip(*(jnp.stack(column) for column in columns[6:])) if planes else None
     return FrictionElements(v, rate, delassus, minv_jt, *forces, planar=planar, loads=loads, planes=tuple(planes))
 

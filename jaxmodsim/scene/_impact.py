@@ -96,7 +96,9 @@ def impact(
     impulse = jnp.where(dense, jnp.concatenate([normal, jnp.zeros_like(v[n:])]), impulse)
     after = v + jnp.sum(struck.delassus * impulse[None, :], axis=1)
     rounding = _ROUNDING * float(jnp.finfo(w.dtype).eps) * jnp.sum(jnp.abs(rows * qd[None, :]), axis=1)
-    still = _constant(jnp.abs(after) <= jnp.maximum(rest, rounding))
+    # A closed gap may have a velocity that is rounding of larger ones before.
+    drift = jnp.concatenate([jnp.where((closed > 0) & ~fired, jnp.abs(w), 0.0), jnp.zeros_like(v[n:])])
+    still = _constant(jnp.abs(after) <= jnp.maximum(jnp.maximum(rest, rounding), drift))
     # An element that an impact begins to load had the mode of one without load.
     loaded = jnp.any((struck.loads > 0) & (touches & (closed == 0))[None, :], axis=1)
     stopped = still[n:] & (loaded | _constant(jnp.abs(v[n:]) > jnp.maximum(rest, rounding[n:])))

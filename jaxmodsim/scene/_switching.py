@@ -77,17 +77,19 @@ def switch(
     rest: Scalar,
     dense: Bool[Array, ""],
     holds: bool,
-) -> tuple[State, Float[Array, " modes"]]:
+) -> tuple[State, Float[Array, " modes"], Float[Array, " modes"]]:
     """State and modes after the guards that `fired`.
 
     Where events accumulate (`dense`) struck contacts close without a rebound. Friction elements that fired there stick
-    regardless of their limits if chatter is held (`holds`), and keep their modes otherwise.
+    regardless of their limits if chatter is held (`holds`), and keep their modes otherwise. A closed contact that would
+    pull opens at the same instant, so that its time has the derivative of this event.
 
     The impact and the friction after it are two functions of `in_scalars`, as one would be too large for it.
 
     **Returns:**
 
-    `(State, modes)`: modes of shape `[modes]`, in the order of `Scene.mode_names`.
+    `(State, modes, touching)`: modes of shape `[modes]`, in the order of `Scene.mode_names`; in `touching`, for the
+    projection, the contacts that would pull are closed.
     """
     slips, closed, sides = scene.split_modes(mode)
     slip_fired, contact_fired, side_fired = scene.split_modes(fired)
@@ -98,12 +100,8 @@ def switch(
         if slips.size:
             whole = _join(slips, sides)
             y, slips = from_dynamics(lambda d: d.switch_friction(slip_fired, slips, rest, held), t, y, scene, whole)
-        return y, _join(slips, sides)
-
-    if scene.switches:
-        # A contact that a switch lifts opens at the same instant, so that its time has the derivative of the switch.
-        push = from_dynamics(lambda d: d.contact_forces, t, y, scene, _join(slips, closed, sides))
-        contact_fired = contact_fired | ((closed > 0) & (push < 0))
+        modes = _join(slips, sides)
+        return y, modes, modes
 
     if not holds:
         slip_fired = slip_fired & ~dense
@@ -113,14 +111,16 @@ def switch(
         return impact(t, q, qd, scene.bind_state(t, q, qd), closed, contact_fired, rest, bounces, dense)
 
     qd, closed, stopped = in_scalars(strike, t, y.q, y.qd, seed=y.q)
-    after = y._replace(qd=qd)
-    if slips.size:
-        struck = jnp.any(contact_fired) & jnp.any(qd != y.qd)
-        after, slips = from_dynamics(
-            lambda d: d.switch_struck(slip_fired, jnp.asarray(stopped), struck, rest, held),
-            *(t, after, scene, _join(slips, closed, sides)),
-        )
-    return after, _join(slips, closed, sides)
+    after, modes = y._replace(qd=qd), _join(slips, closed, sides)
+    struck = jnp.any(contact_fired) & jnp.any(qd != y.qd)
+
+    def rub(d: Dynamics) -> tuple[State, Array, Array]:
+        if not slips.size:
+            return after, slips, d.pulls
+        return *d.switch_struck(slip_fired, jnp.asarray(stopped), struck, rest, held), d.pulls
+
+    after, slips, pulls = from_dynamics(rub, t, after, scene, modes)
+    return after, _join(slips, jnp.where(pulls, 0.0, closed), sides), _join(slips, closed, sides)
 
 
 def _bounces(t: Scalar, y: State, scene: Scene, mode: Float[Array, " modes"]) -> Bool[Array, " contacts"]:

@@ -200,10 +200,10 @@ class RunFunctions(eqx.Module):
         """State after changes of modes and impacts; the same state without them."""
         before = self.system.state(t, s.y, scene)
         assert s.dense is not None
-        state, mode = switch(t, before, scene, s.mode, fired, self.rest, s.dense, self.holds)
+        state, mode, touching = switch(t, before, scene, s.mode, fired, self.rest, s.dense, self.holds)
         after = self.system.replace(t, s.y, state, scene)
         if scene.contacts:  # a contact may have closed; the derivative, too, or the next step would move it
-            after = self.project(t, after, scene, mode)
+            after = self.project(t, after, scene, touching)
         # Without an impact or another mode only rounding has changed: a sample of an input in stick is no event.
         changed = jnp.any(mode != s.mode)
         if scene.contacts:

@@ -160,7 +160,7 @@ def _controller(request: RunRequest, solver: dfx.AbstractSolver) -> dfx.Abstract
     times = sample_times(request.scene.params, linear=True)
     if request.scene.mode_names:
         return EventController(controller, times, direction=1)
-    return StepsTo(controller, times)
+    return controller if request.dt is not None and times is None else StepsTo(controller, times)
 
 
 def _plugins(request: RunRequest, system: IntegratedSystem) -> tuple[Any, Any]:

@@ -122,6 +122,69 @@ def test_a_contact_opens_where_its_reaction_falls_to_zero():
     np.testing.assert_allclose(run.q[-1, 0], A * np.sin(omega * 0.3), rtol=1e-14)
 
 
+def test_a_stop_holds_a_mass_with_friction():
+    """A driven mass on a spring stays at either stop until the drive has fallen by friction; both hold it."""
+    m, k, F, omega, Fc, gap = 1.064, 30.12, 4.141, 3.43, 1.154, 0.1099
+    scene = jms.Scene(
+        lambda t, q, qd, p: 0.5 * m * qd[0] ** 2 - 0.5 * k * q[0] ** 2,
+        effects=(
+            jms.AppliedForce(lambda t, q, qd, p: jnp.stack([F * jnp.sin(omega * t)])),
+            jms.Friction(jms.Coulomb(Fc), name="rail"),
+        ),
+        constraints=jms.end_stops(lambda q: q[0], lower=-gap, upper=gap, restitution=0.0),
+    )
+    run = jms.simulate(scene, [0.0], [0.0], 8.0, **TIGHT)
+    leaves = [change.t for change in run.mode_changes if change.effect == "rail" and change.before == "stick"]
+    # It leaves the upper stop where F sin(omega t) = k gap - Fc, and the lower one half a period later.
+    first = (np.pi - np.arcsin((k * gap - Fc) / F)) / omega
+    half = np.pi / omega
+    np.testing.assert_allclose(leaves[1:], first + half * np.arange(len(leaves) - 1), rtol=1e-9)
+    assert len(leaves) == 1 + int((8.0 - first) / half) + 1
+
+
+def test_openings_of_a_contact_in_single_precision():
+    """A ball on a shaken table, for 64 frequencies, leaves it once a period where its reaction falls to zero."""
+    A, t1 = 0.01, 1.0
+
+    def openings(omega):
+        scene = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), vibrating_table.scene(A=A, omega=omega, e=0.0))
+        start = jnp.zeros(1, jnp.float32), jnp.stack([A * omega])
+        run = jms.simulate(scene, *start, t1, rtol=1e-5, record=("events",), max_events=64, throw=False)
+        return run.result.ok, jnp.where(run.events.after == 0, run.events.t, jnp.inf)
+
+    omega = np.linspace(34.0, 50.0, 64)
+    ok, found = jax.jit(lambda x: jax.lax.map(openings, x))(jnp.asarray(omega, jnp.float32))
+    assert ok.all()
+    for each, t in zip(omega, np.sort(found, axis=1), strict=True):
+        exact = (np.arcsin(9.81 / (A * each**2)) + 2 * np.pi * np.arange(64)) / each
+        np.testing.assert_allclose(t[np.isfinite(t)], exact[exact < t1], atol=2e-5)
+
+
+def test_a_backlash_opens_for_good_in_single_precision():
+    """Where its reaction falls to zero beside friction, for 32 forces; a closed one never pulls."""
+
+    def masses(t, q, qd, p):
+        return 0.25 * qd[0] ** 2 + 0.5 * qd[1] ** 2 - 10.0 * q[1] ** 2
+
+    def ends(F):
+        drive = jms.AppliedForce(lambda t, q, qd, p: jnp.stack([p["F"] * jnp.cos(p["omega"] * t), 0.0 * t]))
+        rail = jms.Friction(jms.Coulomb(0.5), along=lambda q: q[1], name="rail")
+        play = jms.backlash(lambda q: q[0] - q[1], 0.05, restitution=0.0)
+        scene = jms.Scene(masses, {"F": F, "omega": 3.0}, (drive, rail), constraints=play)
+        scene = jax.tree.map(lambda x: jnp.asarray(x, F.dtype), scene)
+        zero, ts = jnp.zeros(2, F.dtype), jnp.linspace(0.0, 3.0, 61, dtype=F.dtype)
+        run = jms.simulate(scene, zero, zero, 3.0, ts=ts, rtol=1e-5 if F.dtype == jnp.float32 else 1e-10, throw=False)
+        return run.result.ok, run.q[-1], jnp.stack([run.reactions[name].multiplier for name in scene.contacts])
+
+    forces = np.linspace(3.99, 4.01, 32)
+    (ok, q, push), (_, exact, _) = (
+        jax.jit(lambda x: jax.lax.map(ends, x))(jnp.asarray(forces, kind)) for kind in (jnp.float32, jnp.float64)
+    )
+    assert ok.all()
+    assert push.min() > -1e-3
+    np.testing.assert_allclose(q, exact, atol=2e-5)
+
+
 def test_a_block_leaves_what_it_has_struck_at_once():
     """A braked block strikes a free one without restitution: it goes on slower, and the contact opens at the impact."""
 

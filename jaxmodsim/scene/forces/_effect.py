@@ -1,7 +1,8 @@
 """Base class of effects, which are forces on the mechanism."""
 
 import abc
-from typing import TYPE_CHECKING, NamedTuple, cast
+import difflib
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -68,6 +69,15 @@ class AbstractEffect(eqx.Module):
         name = cast("str | None", None)  # not a field, which would come before those of the effects
     else:
         name: AbstractVar[str | None]
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Refuse methods whose names are misspelled: the default would be called instead."""
+        super().__init_subclass__(**options)
+        known = [name for name in vars(AbstractEffect) if not name.startswith("_")]
+        for name, value in vars(cls).items():
+            near = difflib.get_close_matches(name.lower(), known, 1, cutoff=0.85)
+            if near and name not in known and (callable(value) or isinstance(value, property)):
+                raise TypeError(f"{cls.__name__}.{name} is no method of AbstractEffect. Did you mean {near[0]!r}?")
 
     def bind_state(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> "AbstractEffect":
         """The effect with its parameters at a state of the mechanism; itself if none of them depends on the state."""

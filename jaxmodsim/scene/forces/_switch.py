@@ -11,11 +11,10 @@ from jaxtyping import PyTree
 from ..._core.arguments import as_label
 from ..._core.arrays import PerDof, Scalar
 from ..._core.functions import as_function, result_shape
+from ..._core.parameters import unless_none
 from ._effect import AbstractEffect, Action
 
-
-def _force(value: object, *, name: str) -> Callable[..., Any] | None:
-    return None if value is None else as_function(value, name=name)
+_force = partial(unless_none, convert=as_function)
 
 
 class Switch(AbstractEffect):

@@ -268,7 +268,10 @@ class EventSolver(AbstractSolverWrapper):
             dfx.ODETerm(_Field(terms)), t0, t1, y0.y, (y0._replace(log=None), args), inner, made_jump
         )
         if self.project is not None:
-            y1, error = projected(y1, error, self.project(t1, y0._replace(y=y1), args).y)
+            y1, distant = projected(y0.y, y1, error, self.project(t1, y0._replace(y=y1), args).y, (t0, t1))
+            # A state that an event has carried on is not projected. Its distance does not shrink with the step.
+            carried = y0.report.landed > 0.5
+            error = jtu.tree_map(lambda a, b: jnp.where(carried, a, b), error, distant)
         path = self.solver.interpolation_cls(t0=t0, t1=t1, **dense)
         length = _constant(t1 - t0)
         unit = opaque_one(length)
