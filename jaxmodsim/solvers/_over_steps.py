@@ -168,8 +168,8 @@ class ForwardOverSteps(AbstractOverSteps):
     def __init__(self, by: StepInputs, run: RecordedRun, keeps: bool):
         super().__init__(by, run)
         self.by, self.keeps = by, keeps
-        self.d_t0, self.d_t1 = _filled(by.t0, run.inputs.t0), _filled(by.t1, run.inputs.t1)
-        self.d_times = [_filled(d, t) for d, t in zip(by.times, run.inputs.times, strict=True)]
+        self.d_t0, self.d_t1 = filled(by.t0, run.inputs.t0), filled(by.t1, run.inputs.t1)
+        self.d_times = [filled(d, t) for d, t in zip(by.times, run.inputs.times, strict=True)]
 
     def result(self) -> RunTangents:
         """Derivatives of the outputs of the run."""
@@ -193,7 +193,7 @@ class ForwardOverSteps(AbstractOverSteps):
     def before_the_run(self) -> _Ahead:
         """Derivatives of the first state, and of the rows saved at t0."""
         inputs, began = self.inputs, (self.inputs.y0, self.inputs.solver_state)
-        d_began = _filled((self.by.y0, self.by.solver_state), began)
+        d_began = filled((self.by.y0, self.by.solver_state), began)
         rows = [jtu.tree_map(jnp.zeros_like, (_numbers(save.ys), save.ts)) for save in self.saves]
         for i, (t0, _, _) in enumerate(self.how.subs):
             if t0:
@@ -316,10 +316,10 @@ class ReverseOverSteps(AbstractOverSteps):
         self.by, self.cts = by, cts
         # Cotangents of the values and times of each `SubSaveAt`; None if nothing depends on them.
         self.rows = [
-            _filled(ct, (kept.ys, kept.ts)) if jtu.tree_leaves(ct) else None
+            filled(ct, (kept.ys, kept.ts)) if jtu.tree_leaves(ct) else None
             for ct, kept in zip(cts.saved, self.saves, strict=True)
         ]
-        self.dense = _filled(cts.dense_infos, run.final.dense_infos) if jtu.tree_leaves(cts.dense_infos) else None
+        self.dense = filled(cts.dense_infos, run.final.dense_infos) if jtu.tree_leaves(cts.dense_infos) else None
 
     def result(self) -> StepInputs:
         """Cotangents of the inputs."""
@@ -347,7 +347,7 @@ class ReverseOverSteps(AbstractOverSteps):
         first, every = (self.inputs.y0, self.inputs.solver_state), self.how.every
         back = _Back(
             self.count - 1,
-            _filled((cts.y, cts.solver_state), (final.y, final.solver_state)),
+            filled((cts.y, cts.solver_state), (final.y, final.solver_state)),
             empty_buffers(first, every) if every > 1 else None,
             jtu.tree_map(jnp.zeros_like, self.numbers),
             jnp.zeros_like(t0),
@@ -466,7 +466,7 @@ def _numbers(tree: PyTree) -> PyTree:
     return eqx.filter(tree, eqx.is_inexact_array)
 
 
-def _filled(change: PyTree, like: PyTree) -> PyTree:
+def filled(change: PyTree, like: PyTree) -> PyTree:
     """Derivatives or cotangents with zeros in place of None."""
 
     def fill(x: PyTree, d: PyTree) -> PyTree:

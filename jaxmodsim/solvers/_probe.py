@@ -14,6 +14,7 @@ from jax import lax
 from jaxtyping import Array, PyTree
 
 from .._core.arrays import Real
+from ._over_steps import filled, is_none
 from .events._state import EventState
 
 # Change in a number that is zero, which has no magnitude.
@@ -28,6 +29,10 @@ _OF_ATOL, _ROUNDINGS, _RESOLVED = 1e-6, 16.0, 64.0
 # At rest forces cancel up to their rounding, the only error of the state: as an error of the tangent it is at most this
 # many times as large. It is no more than this part of the tolerance of the state.
 _OF_ERROR, _OF_TOLERANCE = 8.0, 0.1
+# Over a kink of the field, as that of |v|, the error of a tangent falls in proportion to the step, and steps may end at
+# the resolution of time. Shorter than so many of the shortest, a step has this tolerance, in parts of the root of a
+# rounding: 1 % in float32. A larger error still ends the run: without this bound some derivatives were wrong by half.
+_SHORT, _OVER_A_KINK = 8.0, 32.0
 
 
 class ProbeTangent(NamedTuple):
@@ -68,20 +73,20 @@ def direction(step: PyTree, y0: PyTree, asked: tuple[PyTree, PyTree], controller
         zero, size = _OF_ZERO * jnp.maximum(jnp.max(size), 1.0), jnp.where(size > 0, jnp.maximum(size, least), 0.0)
         return jnp.asarray(part, x.dtype) * jnp.where(size > 0, size, zero).astype(x.dtype)
 
-    of_step = jtu.tree_map(partial(change, 0.0), asked[0], step, is_leaf=_is_none)
-    return of_step, jtu.tree_map(partial(change, resolved), asked[1], y0, is_leaf=_is_none)
+    of_step = jtu.tree_map(partial(change, 0.0), asked[0], step, is_leaf=is_none)
+    return of_step, jtu.tree_map(partial(change, resolved), asked[1], y0, is_leaf=is_none)
 
 
 def start(
     t0: Array, y0: PyTree, solver_state: PyTree, change: PyTree, project: Callable[[Array, PyTree], PyTree] | None
 ) -> Probed:
     """The initial state of a run, and its change after the projection."""
-    tangent = _filled(change, y0)
+    tangent = filled(change, y0)
     if project is not None:
         numbers, rest = eqx.partition(y0, eqx.is_inexact_array)
         moved = lambda x: eqx.filter(project(t0, eqx.combine(x, rest)), eqx.is_inexact_array)  # noqa: E731
         tangent = jax.jvp(moved, (numbers,), (tangent,))[1]
-    tangent = _moving(tangent), _filled(None, solver_state)
+    tangent = _moving(tangent), filled(None, solver_state)
     counts = jnp.asarray(1.0 if project is None else 0.0, t0.dtype)
     return Probed(y0, ProbeTangent(tangent, jtu.tree_map(jnp.abs, _integrated(tangent[0])), counts))
 
@@ -96,8 +101,8 @@ class ProbedStep(NamedTuple):
     def __call__(self, t0: Array, t1: Array, y: Probed, state: PyTree, jump: Real) -> tuple[Any, ...]:
         """The step; its error estimate is a pair: that of the state, and the size of that of the probe."""
         held, probe = y.y, y.probe
-        numbers = jtu.tree_map(lambda d, x: None if d is None else x, self.change, self.step, is_leaf=_is_none)
-        rest = jtu.tree_map(lambda d, x: x if d is None else None, self.change, self.step, is_leaf=_is_none)
+        numbers = jtu.tree_map(lambda d, x: None if d is None else x, self.change, self.step, is_leaf=is_none)
+        rest = jtu.tree_map(lambda d, x: x if d is None else None, self.change, self.step, is_leaf=is_none)
         moving, others = eqx.partition((_moving(held), state), eqx.is_inexact_array)
 
         def advance(numbers: PyTree, moving: PyTree) -> tuple[PyTree, PyTree]:
@@ -111,26 +116,30 @@ class ProbedStep(NamedTuple):
         )
         largest = jtu.tree_map(lambda d, x: jnp.maximum(jnp.abs(d), x), _integrated(tangent[0]), probe.largest)
         ends = jtu.tree_map(lambda a, b: jnp.maximum(jnp.abs(a), jnp.abs(b)), _integrated(held), _integrated(y1))
-        errors = jnp.where(probe.counts > 0, self._size(error, error_of_probe, largest, ends), 0.0)
+        errors = jnp.where(probe.counts > 0, self._size((t0, t1), error, error_of_probe, largest, ends), 0.0)
         after = ProbeTangent(tangent, largest, jnp.ones_like(probe.counts))
         return Probed(y1, after), (error, errors), dense, state1, result
 
-    def _size(self, error: PyTree, error_of_probe: PyTree, largest: PyTree, y: PyTree) -> Array:
+    def _size(self, times: tuple[Array, Array], error: PyTree, of_probe: PyTree, largest: PyTree, y: PyTree) -> Array:
         """Size of the probe's error in parts of its tolerance."""
         control = _pid(self.controller)[0]
         rtol, atol = lax.stop_gradient((control.rtol, control.atol))
+        (t0, t1), dtmin = times, 0.0 if control.dtmin is None else control.dtmin
+        shortest = jnp.maximum(dtmin, float(jnp.finfo(t0.dtype).eps) * jnp.maximum(jnp.abs(t0), jnp.abs(t1)))
+        short = lax.stop_gradient(t1 - t0 < _SHORT * shortest)
 
         def size(of_state: Array, of_tangent: Array, largest: Array, y: Array) -> Array:
             of_state, tolerance = jnp.abs(of_state), atol + rtol * y
             moves = jnp.minimum(1.0, of_state / (_MOVES * tolerance))
             eps = float(jnp.finfo(y.dtype).eps)
-            relative = jnp.maximum(_AT_REST * (1.0 + (_IN_MOTION - 1.0) * moves) * rtol, _RESOLVED * eps)
+            resolved = jnp.where(short, _OVER_A_KINK * eps**0.5, _RESOLVED * eps)
+            relative = jnp.maximum(_AT_REST * (1.0 + (_IN_MOTION - 1.0) * moves) * rtol, resolved)
             tangent = jnp.maximum(largest, _OF_ARRAY * jnp.max(largest))
             noise = _OF_ATOL * atol + _ROUNDINGS * eps * y
             noise = noise + jnp.minimum(_OF_ERROR * of_state, _OF_TOLERANCE * tolerance)
             return jnp.sqrt(jnp.mean(jnp.square(of_tangent / (relative * tangent + noise))))
 
-        return jnp.max(jnp.stack(jtu.tree_leaves(jtu.tree_map(size, error, error_of_probe, largest, y))))
+        return jnp.max(jnp.stack(jtu.tree_leaves(jtu.tree_map(size, error, of_probe, largest, y))))
 
 
 class ProbedController(NamedTuple):
@@ -167,10 +176,6 @@ def _is_pid(x: object) -> bool:
     return isinstance(x, dfx.PIDController)
 
 
-def _is_none(x: object) -> bool:
-    return x is None
-
-
 def _integrated(y: PyTree) -> PyTree:
     """The part of the state that has an error estimate."""
     return y.y if isinstance(y, EventState) else y
@@ -183,11 +188,3 @@ def _moving(y: PyTree) -> PyTree:
 
 def _with_moving(y: PyTree, moving: PyTree) -> PyTree:
     return moving._replace(log=y.log) if isinstance(y, EventState) else moving
-
-
-def _filled(change: PyTree, like: PyTree) -> PyTree:
-    """`change` with zeros in the place of None; zeros if it is None itself."""
-    like = eqx.filter(like, eqx.is_inexact_array)
-    if change is None:
-        return jtu.tree_map(jnp.zeros_like, like)
-    return jtu.tree_map(lambda x, d: jnp.zeros_like(x) if d is None else d, like, change)

@@ -147,3 +147,25 @@ def test_velocities_pass_zero_at_the_default_tolerance() -> None:
     assert ok.all()
     assert q.dtype == F
     np.testing.assert_allclose(q, ends, atol=1e-4)
+
+
+def test_derivatives_pass_the_kink_of_a_bristle() -> None:
+    """Its rate has |v|: over a reversal the error of a tangent falls with the step, to the resolution of time."""
+
+    def spring(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        return 0.5 * p["m"] * qd[0] ** 2 - 0.5 * p["k"] * q[0] ** 2 + p["F"] * jnp.sin(3.0 * t) * q[0]
+
+    def end(x: Any, rtol: float) -> tuple[Any, Any]:
+        m, k, force, Fc, sigma0 = x
+        law = jax.tree.map(lambda y: jnp.asarray(y, x.dtype), jms.LuGre(sigma0, 20.0, 0.1, Fc, 1.3, 0.05))
+        scene = jms.Scene(spring, {"m": m, "k": k, "F": force}, (jms.Friction(law),))
+        run = jms.simulate(scene, 0.0 * x[:1], 0.0 * x[:1], 5.0, rtol=rtol, throw=False)
+        return jnp.stack([run.q[-1, 0], run.qd[-1, 0]]), run.code
+
+    x, part = np.array([1.0, 10.0, 2.0, 1.0, 1e3]), np.array([0.5, -0.3, 0.8, 1.0, 1.2])
+    slope = jax.jit(lambda x, d: jax.jvp(lambda x: end(x, 1e-6), (x,), (d,), has_aux=True)[1:])
+    single, code = slope(x.astype(F), (x * part).astype(F))
+    moved = jnp.stack([x * (1.0 + change * part) for change in (-1e-5, 1e-5)])
+    before, after = jax.jit(lambda x: jax.lax.map(lambda x: end(x, 1e-11)[0], x))(moved)
+    assert code == 0
+    np.testing.assert_allclose(single, (after - before) / 2e-5, rtol=1e-4)
