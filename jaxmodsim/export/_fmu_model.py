@@ -95,8 +95,9 @@ class Model(NamedTuple):
 
     def guards(self, t: Array, p: Scene, y: State, m: Array, tol: Array) -> PyTree:
         """Guards, their tolerances, and their values at events."""
-        given = forward_dynamics(t, y, p, m).guards(tol[0], (tol[1], tol[2]))
-        return (*given, *([jnp.zeros_like(m)] * (3 - len(given))))
+        values, limits, roots = forward_dynamics(t, y, p, m).guards(tol[0], (tol[1], tol[2]))
+        slips, *others = p.split_modes(roots)  # doubles resolve the roots of friction
+        return values, limits, jnp.concatenate([jnp.zeros_like(slips), *others])
 
     def on_constraints(self, t: Array, p: Scene, y: State, m: Array) -> State:
         """The state on the constraints."""

@@ -190,16 +190,15 @@ class Dynamics(NamedTuple):
 
         The guard of an open contact is its gap, that of a closed one its multiplier. A gap closes only below zero by
         more than its rounding, because it starts from zero after an impact and when a contact opens. The guard of a
-        switch is multiplied by its mode. Scenes with contacts also return the values of the guards at their events,
-        which for gaps is the rounding.
+        switch is multiplied by its mode. The values of the guards at their events come third: rounding, or zero.
         """
         friction, gaps, sides = self._modes
-        guards, atol, roots = [], [], [jnp.zeros_like(friction)]
+        guards, atol, roots = [], [], []
         if friction.size:
             assert self.friction is not None
-            slowest = self._speed_of_rest(rest)
-            of_friction = friction_guards(self.friction_elements, self.friction, friction, slowest, tolerances)
-            guards, atol = [of_friction[0]], [of_friction[1]]
+            speeds = self._speed_of_rest(rest), self._rounding_of_slip
+            found = friction_guards(self.friction_elements, self.friction, friction, *speeds, tolerances)
+            guards, atol, roots = ([each] for each in found)
         if gaps.size:
             contacts, at = self.scene.contacts.values(), (self.t, self.y.q, self.scene.params)
             wide = jnp.concatenate([each.error(*at) for each in contacts])
@@ -213,18 +212,12 @@ class Dynamics(NamedTuple):
             guards.append(sides * jnp.stack(values))
             atol.append(jnp.zeros_like(sides))
             roots.append(jnp.zeros_like(sides))
-        return tuple(jnp.concatenate(each) for each in (guards, atol, *([roots] if gaps.size else [])))
+        return tuple(jnp.concatenate(each) for each in (guards, atol, roots))
 
     def start_friction(self, rest: Scalar) -> tuple[State, Float[Array, " n"]]:
         """Initial state, and modes of the friction elements, which do not depend on those in `mode`."""
-        t, y, scene, elements = self.t, self.y, self.scene, self.friction_elements
-        speed = []
-        for each in scene.event_driven.values():
-            row = each.direction(y.q, scene.params)
-            size = jnp.sum(jnp.abs(row * jnp.broadcast_to(y.qd, row.shape))) + jnp.sum(jnp.abs(each.belt(t)))
-            speed += [size] if row.ndim == 1 else [size] * row.shape[0]
-        rounding = 8.0 * float(jnp.finfo(y.q.dtype).eps) * jax.lax.stop_gradient(jnp.stack(speed))
-        v = elements.v[: len(speed)]
+        elements, rounding = self.friction_elements, self._rounding_of_slip
+        v = elements.v[: rounding.size]
         still = elements.magnitude(v) <= jnp.maximum(rounding, rest)
         rest = self._speed_of_rest(rest)
         mode = next_modes(
@@ -294,6 +287,16 @@ class Dynamics(NamedTuple):
     def _stick(self, mode: Float[Array, " n"]) -> State:
         elements = self.friction_elements
         return self.y._replace(qd=stop_slip(elements, self.y.qd, elements.sticks(mode)))
+
+    @property
+    def _rounding_of_slip(self) -> Float[Array, " n"]:
+        """Rounding error [m/s] of the slip of each element, in each of its rows; constant."""
+        speed = []
+        for each in self.scene.event_driven.values():
+            row = each.direction(self.y.q, self.scene.params)
+            size = jnp.sum(jnp.abs(row * jnp.broadcast_to(self.y.qd, row.shape))) + jnp.sum(jnp.abs(each.belt(self.t)))
+            speed += [size] if row.ndim == 1 else [size] * row.shape[0]
+        return 8.0 * float(jnp.finfo(self.y.q.dtype).eps) * jax.lax.stop_gradient(jnp.stack(speed))
 
     def _speed_of_rest(self, rest: Scalar) -> Scalar:
         assert self.friction is not None

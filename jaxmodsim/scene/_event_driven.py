@@ -33,6 +33,9 @@ _LEAST_SHARE = 1e-2
 # Rounding units in the load of a sticking element, of its limits.
 _LOAD_ROUNDING = 100.0
 
+# Rounding units by which the limits of stick are further out.
+_WIDER = 16.0
+
 # The reference velocity of a plane is renewed where slip has fallen to, or grown to, this multiple of it ...
 _SHRUNK, _GROWN = 0.1, 1e4
 # ... but is at least this multiple of the speed of rest: the direction is rounded off below a part of the reference
@@ -365,13 +368,14 @@ def friction_guards(
     forces: FrictionForces,
     mode: Float[Array, " modes"],
     rest: Scalar,
+    rounding: Float[Array, " modes"],
     tolerances: tuple[Array, Array],
-) -> tuple[Float[Array, " modes"], Float[Array, " modes"]]:
-    """One guard for each row with a mode, positive while the mode holds, and the error that each may have.
+) -> tuple[Float[Array, " modes"], Float[Array, " modes"], Float[Array, " modes"]]:
+    """One guard for each row with a mode, positive while the mode holds, its admissible error, its value at its event.
 
     In stick `(upper - f)(lower + f)/(upper + lower)` [N], which falls through zero at either limit with the slope of
     the force; its error is relative, the first of `tolerances`, to the limits. In slip the velocity in the direction of
-    the mode [m/s], with the absolute error. Rounding must not make a mode flicker: the limits are 16 rounding units
+    the mode [m/s], with the absolute error and `rounding`. Rounding must not make a mode flicker: the limits are 16 rounding units
     further out, and a slip has to reverse by `rest` [m/s] before it ends (an element may slip at its limit while others
     hold it).
 
@@ -383,7 +387,7 @@ def friction_guards(
     force, upper, lower = (x[:n] for x in forces[:3])
     force = elements.in_planes(force, lambda part: safe_norm(force[part]))
     eps = float(jnp.finfo(force.dtype).eps)
-    wider = 1.0 + 16.0 * eps
+    wider = 1.0 + _WIDER * eps
     span = upper + lower
     inside = (wider * upper - force) * (wider * lower + force) / jnp.where(span > 0, span, 1.0)
     resolved = jnp.maximum(rtol, _LOAD_ROUNDING * eps) * span
@@ -394,7 +398,9 @@ def friction_guards(
         return jnp.stack([along + end] + (part.stop - part.start - 1) * [_GROWN * speed - along])
 
     slip, sticks = elements.in_planes(mode * elements.v[:n] + rest, in_plane), elements.sticks(mode)
-    return jnp.where(sticks, inside, slip), jnp.where(sticks, resolved, atol)
+    values = jnp.where(sticks, inside, slip), jnp.where(sticks, resolved, atol + rounding)
+    slow = elements.in_planes(0.25 * rounding, lambda part: 0.0 * rounding[part])
+    return *values, jnp.where(sticks, _WIDER * eps * span, slow)
 
 
 def speed_of_rest(elements: FrictionElements, forces: FrictionForces, rest: Scalar, t: Scalar) -> Scalar:

@@ -80,27 +80,32 @@ def test_slip_in_a_plane_has_forces_of_its_own() -> None:
 
 
 def test_guards_fall_through_zero_at_the_limits() -> None:
+    rounding = jnp.array([1e-9, 4e-9])
     for load, guard in ((1.0, 0.0), (-1.0, 0.0), (0.5, 0.375), (0.0, 0.5)):
         elements = scalars(free_slip_acceleration=[2.0 * load, load])
         forces = solve_friction_forces(elements, jnp.zeros(2))
         np.testing.assert_allclose(forces.force[0], load, atol=1e-14)
         forces = forces._replace(force=jnp.array([load, 0.0]))  # without rounding
-        value, error = friction_guards(elements, forces, jnp.zeros(2), REST, TOLERANCES)
+        value, error, event = friction_guards(elements, forces, jnp.zeros(2), REST, rounding, TOLERANCES)
         np.testing.assert_allclose(value[0], guard, atol=1e-14)
+        assert 0 < event[0] < 1e-13
         assert value[0] > 0  # not at the limit itself: rounding must not end a stick
         np.testing.assert_allclose(error, 2e-6)
     moving = scalars(v=[0.2, -0.2])
     slip = solve_friction_forces(moving, jnp.ones(2))
-    value, error = friction_guards(moving, slip, jnp.ones(2), REST, TOLERANCES)
+    value, error, event = friction_guards(moving, slip, jnp.ones(2), REST, rounding, TOLERANCES)
     np.testing.assert_allclose(value, [0.2, -0.2], atol=1e-8)
-    np.testing.assert_array_equal(error, 1e-8)
+    np.testing.assert_allclose(error, [1.1e-8, 1.4e-8], rtol=1e-12)
+    np.testing.assert_allclose(event, [0.25e-9, 1e-9], rtol=1e-12)
 
 
 def test_guards_of_a_plane_ask_for_a_new_reference_velocity() -> None:
     """Slip of 0.05 m/s along the reference velocity of 1 m/s is half of what renews it; another part is far away."""
     mode = jnp.array([0.6, 0.8, 0.0])
     elements = plane([0.03, 0.04, 0.0])
-    value, _ = friction_guards(elements, solve_friction_forces(elements, mode), mode, REST, TOLERANCES)
+    forces = solve_friction_forces(elements, mode)
+    value, _, event = friction_guards(elements, forces, mode, REST, jnp.full(3, 1e-9), TOLERANCES)
+    np.testing.assert_array_equal(event[:2], 0.0)
     np.testing.assert_allclose(value[:2], [0.05 - 0.1, 1e4 - 0.05], rtol=1e-12)
     renewed, changes = renew_slip(elements, mode, jnp.array([True, False, False]), REST)
     np.testing.assert_allclose(renewed, [0.03, 0.04, 0.0], rtol=1e-12)

@@ -169,3 +169,43 @@ def test_derivatives_pass_the_kink_of_a_bristle() -> None:
     before, after = jax.jit(lambda x: jax.lax.map(lambda x: end(x, 1e-11)[0], x))(moved)
     assert code == 0
     np.testing.assert_allclose(single, (after - before) / 2e-5, rtol=1e-4)
+
+
+def test_derivatives_of_a_clutch_whose_slip_is_rounding() -> None:
+    """Behind a break-away the slip is a difference of velocities that are 1e7 times as large; for five clutches."""
+
+    def clutch(x: Any) -> jms.Scene:
+        law, p = jms.Stribeck(Fc=x[4], Fs=1.3 * x[4], vs=0.3), {"J": x[:2], "T": x[2], "d": x[3], "N": x[5], "w": x[6]}
+        torque = jms.AppliedForce(lambda t, q, qd, p: jnp.stack([p["T"] - 0.1 * qd[0], -p["d"] * qd[1]]))
+        plates = jms.Friction(
+            law,
+            along=lambda q: q[0] - q[1],
+            normal_force=lambda t, q, qd, p: p["N"] * jnp.clip(t - 0.5, 0, 1) * (1 - 0.8 * jnp.sin(p["w"] * t) ** 2),
+        )
+        scene = jms.Scene(lambda t, q, qd, p: 0.5 * jnp.sum(p["J"] * qd**2), p, (torque, plates))
+        return jax.tree.map(lambda n: jnp.asarray(n, x.dtype), scene)
+
+    def events(x: Any) -> tuple[Any, Any]:
+        """Whether the run ends well; times of events, and their derivatives along the numbers of the clutch."""
+
+        def times(x: Any) -> tuple[Any, Any]:
+            q0, qd0 = jnp.zeros(2, x.dtype), jnp.asarray([10.0, 0.0], x.dtype)
+            rtol = 1e-5 if x.dtype == F else 1e-11
+            run = jms.simulate(clutch(x), q0, qd0, 6.0, rtol=rtol, record=("events",), throw=False)
+            return jnp.where(jnp.isfinite(run.events.t), run.events.t, 0.0), run.result.ok
+
+        return jax.jvp(times, (x,), (x,), has_aux=True)
+
+    numbers = np.array(
+        [
+            [0.54113954, 1.1240969, 3.992858, 0.1956649, 0.25359812, 36.218075, 1.720873],
+            [0.6595295, 0.66881, 3.470771, 0.2587157, 0.1480656, 45.59356, 1.780515],
+            [0.3290633, 0.6143131, 3.191928, 0.2258665, 0.2760853, 27.43927, 1.923342],
+            [0.5116981, 1.019342, 2.996398, 0.2951827, 0.2036226, 41.01647, 1.971936],
+            [0.6249341, 1.134312, 4.100193, 0.4021715, 0.2397198, 51.54245, 1.595435],
+        ]
+    )
+    found, exact = (jax.jit(lambda x: jax.lax.map(events, x))(jnp.asarray(numbers, kind)) for kind in (F, np.float64))
+    assert found[2].all()
+    np.testing.assert_allclose(found[0], exact[0], atol=2e-3)
+    np.testing.assert_allclose(found[1], exact[1], rtol=0.05, atol=0.01)
