@@ -375,9 +375,9 @@ def friction_guards(
 
     In stick `(upper - f)(lower + f)/(upper + lower)` [N], which falls through zero at either limit with the slope of
     the force; its error is relative, the first of `tolerances`, to the limits. In slip the velocity in the direction of
-    the mode [m/s], with the absolute error and `rounding`. Rounding must not make a mode flicker: the limits are 16 rounding units
-    further out, and a slip has to reverse by `rest` [m/s] before it ends (an element may slip at its limit while others
-    hold it).
+    the mode [m/s], with the absolute error and `rounding`. Rounding must not make a mode flicker: the limits
+    are 16 rounding units further out, and a slip has to reverse by `rest` [m/s] before it ends (an element may slip at
+    its limit while others hold it).
 
     In stick in a plane f is the magnitude of the force. In slip the guard of the first row is the velocity along the
     reference velocity, less the part of it below which the reference is renewed, or plus `rest` if slip ends next. The
