@@ -137,9 +137,9 @@ def as_mapping(value: object, *, name: str, example: str) -> dict[str, PyTree]:
     return dict(value)
 
 
-def nearest(name: str, known: Iterable[str]) -> str | None:
-    """The known name that is most similar; None if none is similar."""
-    matches = difflib.get_close_matches(name, list(known), n=1)
+def nearest(name: str, known: Iterable[str], least: float = 0.6) -> str | None:
+    """The known name that is most similar; None if the similarity of all is below `least`, 1 for equal names."""
+    matches = difflib.get_close_matches(name, list(known), n=1, cutoff=least)
     return matches[0] if matches else None
 
 

@@ -1,9 +1,14 @@
-"""Functions with finite derivatives at zero."""
+"""Functions with finite derivatives at zero, and rounding errors."""
+
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
+
+# Rounding units in each term of a function.
+_ROUNDING = 4.0
 
 
 def safe_power(base: Float[Array, "..."], exponent: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -73,3 +78,15 @@ def safe_norm(x: Float[Array, "..."], *, axis: int = -1) -> Float[Array, "..."]:
     squares = jnp.sum((x / scale) ** 2, axis=axis, keepdims=True)
     norm = jnp.where(vanishes, 0.0, scale * jnp.sqrt(jnp.where(vanishes, 1.0, squares)))
     return jnp.squeeze(norm, axis)
+
+
+def rounding_of(
+    fn: Callable[..., Float[Array, " n"]], *at: Float[Array, "..."], least: tuple[Float[Array, ""] | float, ...]
+) -> Float[Array, " n"]:
+    """Error of each value of `fn(*at)` by the rounding of the arguments plus their `least` error; constant."""
+    at = jax.lax.stop_gradient(at)
+    total = 0.0
+    for slope, x, error in zip(jax.jacrev(fn, tuple(range(len(at))))(*at), at, least, strict=True):
+        error = _ROUNDING * float(jnp.finfo(x.dtype).eps) * jnp.abs(x) + error
+        total += jnp.sum(jnp.abs(slope) * jnp.broadcast_to(error, slope.shape), axis=tuple(range(1, slope.ndim)))
+    return jax.lax.stop_gradient(jnp.asarray(total))

@@ -215,7 +215,7 @@ def _model(
     projects = bool(scene.bilateral or scene.contacts) or scene.stick_drifts
     given = as_mapping(outputs, name="fmu outputs", example="{'height [m]': fn}")
     named = {name.partition("[")[0].strip(): fn for name, fn in given.items()}
-    return Model(scene, y, sum(scene.mode_widths(q.shape[0])), projects, named), [max(x, 0) for x in marks.values()]
+    return Model(scene, y, scene.num_modes(q.shape[0]), projects, named), [max(x, 0) for x in marks.values()]
 
 
 def _is_signal(x: object) -> bool:
@@ -251,7 +251,8 @@ def _variables(
         add(f"der({label.name})", "local", "continuous", unit=unit, derivative=first + i)
     guards = range(len(variables), len(variables) + model.modes)
     widths = scene.mode_widths(dof)
-    for name, width in zip(scene.mode_names, widths, strict=True):
+    kinks = [f"kink_{i + 1}" for i in range(scene.num_kinks)]
+    for name, width in zip([*scene.mode_names, *kinks], [*widths, *[1 for _ in kinks]], strict=True):
         for each in _components(f"{name}.guard", (width,) if width > 1 else ()):
             add(each, "local", "continuous")
     for name, shape in series_of(model).items():

@@ -8,11 +8,11 @@ from typing import Any, ClassVar, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import ArrayLike
+from jaxtyping import Array, ArrayLike, Float
 
 from .._core.arrays import Scalar
 from .._core.parameters import Number, NumberOrState, as_number, optional_parameter, parameter, state_parameter
-from ._law import AbstractSetValuedLaw, register_law
+from ._law import AbstractSetValuedLaw, register_law, side_of
 from ._static import Coulomb, exponential, stribeck_power
 from ._wrappers import need_set_valued
 
@@ -72,6 +72,7 @@ class Geared(AbstractSetValuedLaw):
     drive: AbstractSetValuedLaw = eqx.field(converter=_per_torque)
     torque: NumberOrState = state_parameter("Geared torque")
     back: AbstractSetValuedLaw | None = eqx.field(default=None, converter=_unless_none)
+    sides: Float[Array, " 1"] | None = eqx.field(default_factory=lambda: None, init=False, repr=False)
     stiff: ClassVar[bool] = False
     description: ClassVar[str] = "a load-independent law, and one per transmitted torque, for driving and back-driving"
     equations: ClassVar[tuple[str, ...]] = (
@@ -79,12 +80,14 @@ class Geared(AbstractSetValuedLaw):
         "law + |torque| back(|v|) sign(v) for torque v < 0",
     )
     mujoco_lacks: ClassVar[str] = ": the friction of its joints does not depend on the transmitted torque"
+    kinks: ClassVar[tuple[Callable[[Any], Scalar], ...]] = (lambda law: law.torque,)
 
     def _per_torque(self, side: Scalar, of: Callable[[AbstractSetValuedLaw], Scalar]) -> Scalar:
         """`|tau|` times `of(drive)` or `of(back)`, for slip towards `side` (+1 or -1)."""
         power, drive = side * self.torque, of(self.drive)
         back = drive if self.back is None else of(self.back)
-        return jnp.where(power >= 0, power * drive, -power * back)
+        drives = side * side_of(self.torque, self.sides, 0) >= 0
+        return jnp.where(drives, power * drive, -power * back)
 
     def sliding_force(self, v: Scalar) -> Scalar:
         """Magnitude [N] of the dry part in slip."""
@@ -202,6 +205,7 @@ class ServoGear(AbstractSetValuedLaw):
     Kes: Number | None = optional_parameter("Kes", "N/N", lower=0.0)
     Kmq: Number = _load_term("Kmq", "N/N^2")
     Keq: Number | None = optional_parameter("Keq", "N/N^2", lower=0.0)
+    sides: Float[Array, " 3"] | None = eqx.field(default_factory=lambda: None, init=False, repr=False)
     stiff: ClassVar[bool] = False
     description: ClassVar[str] = "servo gear under the torques of motor and load: models M1 to M6"
     equations: ClassVar[tuple[str, ...]] = (
@@ -209,6 +213,11 @@ class ServoGear(AbstractSetValuedLaw):
         "s = Kcs + |Kms motor - Kes external| + Kmq motor^2 or Keq external^2",
     )
     mujoco_lacks: ClassVar[str] = ": the friction of its joints does not depend on torques"
+    kinks: ClassVar[tuple[Callable[[Any], Scalar], ...]] = (
+        lambda law: law.Km * law.motor - _or(law.Ke, law.Km) * law.external,
+        lambda law: law.Kms * law.motor - _or(law.Kes, law.Kms) * law.external,
+        lambda law: jnp.where((law.Kmq == 0) & (_or(law.Keq, law.Kmq) == 0), 0.0, law._larger),
+    )
 
     @classmethod
     def published(cls, actuator: str, model: str, motor: Torque, external: Torque) -> "ServoGear":
@@ -235,23 +244,28 @@ class ServoGear(AbstractSetValuedLaw):
             )
         return cls(motor, external, **sets[actuator][model])
 
-    def _difference(self, by_motor: Scalar, by_external: Scalar) -> Scalar:
+    def _difference(self, by_motor: Scalar, by_external: Scalar, kink: int) -> Scalar:
         """`|by_motor tau_m - by_external tau_e|`, at zero with derivatives of one side: of growing coefficients."""
         torque = by_motor * self.motor - by_external * self.external
-        side = jnp.where(torque == 0, self.motor - self.external, torque)
+        side = jnp.where(torque == 0, self.motor - self.external, side_of(torque, self.sides, kink))
         return jnp.where(side >= 0, torque, -torque)
 
     def _constant(self) -> Scalar:
         """Dry part at any speed [N m]."""
-        return self.Kc + self._difference(self.Km, _or(self.Ke, self.Km))
+        return self.Kc + self._difference(self.Km, _or(self.Ke, self.Km), 0)
 
     def _falling(self) -> Scalar:
         """Stribeck part at rest [N m], which falls with speed."""
-        motor, external = self.motor, self.external
-        larger = jnp.abs(motor) > jnp.abs(external)
-        quadratic = jnp.where(larger, _or(self.Keq, self.Kmq) * external**2, self.Kmq * motor**2)
-        linear = self.Kcs + self._difference(self.Kms, _or(self.Kes, self.Kms))
+        motor, external, Keq = self.motor, self.external, _or(self.Keq, self.Kmq)
+        larger = jnp.where((self.Kmq == 0) & (Keq == 0), self._larger, side_of(self._larger, self.sides, 2))
+        quadratic = jnp.where(larger > 0, Keq * external**2, self.Kmq * motor**2)
+        linear = self.Kcs + self._difference(self.Kms, _or(self.Kes, self.Kms), 1)
         return linear + jnp.where(motor * external < 0, quadratic, 0.0)
+
+    @property
+    def _larger(self) -> Scalar:
+        """Excess of the motor's torque over that of the load [N m], in magnitude."""
+        return jnp.abs(self.motor) - jnp.abs(self.external)
 
     def sliding_force(self, v: Scalar) -> Scalar:
         """Magnitude [N m] of the dry part in slip."""

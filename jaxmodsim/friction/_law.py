@@ -229,6 +229,9 @@ class AbstractSetValuedLaw(AbstractLaw):
 
     execution: ClassVar[str] = "exactly, by events; or in a wrapper"
     limitations: ClassVar[Mapping[str, str]] = {**_JUMPS, **_NO_MEMORY}
+    # Numbers of a law at a state at whose zeros its force has a kink. A law with kinks has a field `sides`: the signs
+    # of these numbers in a step; None, or zeros, for their own.
+    kinks: ClassVar[tuple[Callable[[Any], Scalar], ...]] = ()
 
     @abc.abstractmethod
     def sliding_force(self, v: Scalar) -> Scalar:
@@ -257,6 +260,11 @@ class AbstractSetValuedLaw(AbstractLaw):
         - `vs`: Stribeck velocity [m/s] for a law whose force jumps from stick to slip.
         """
         return None
+
+
+def side_of(number: Scalar, sides: Float[Array, " kinks"] | None, kink: int) -> Scalar:
+    """A number with the sign of the kink at `number`: that of `sides`, or its own."""
+    return number if sides is None else jnp.where(sides[kink] == 0, number, sides[kink])
 
 
 class AbstractKarnoppLaw(AbstractLaw):

@@ -15,7 +15,7 @@ from .._core.arrays import PerDof, Scalar, is_known
 from .._core.functions import as_function
 from .._core.parameters import AbstractRanged, Default, Number, Range, parameter, parameter_or
 from .._core.position import PositionFn, ScalarOrFn, as_optional_position_fn, as_position_fn, as_scalar_or_fn
-from .._core.safe import safe_power
+from .._core.safe import rounding_of, safe_power
 from ._constraints import AbstractEquations, AbstractPositionConstraint
 
 # Newton steps to the speed after an impact; at low speed each of the first steps only halves the error.
@@ -134,10 +134,6 @@ class HuntCrossley(AbstractRanged):
         return jnp.where(y > 1e-6, (1.0 - step(0, u)) / jnp.where(y > 1e-6, y, 1.0), 1.0 - y / 1.5)
 
 
-# Rounding error of a gap, in rounding units of its terms.
-_ROUNDING = 4.0
-
-
 class Contact(AbstractPositionConstraint):
     """A unilateral contact `gap(t, q, params) >= 0` that is open or closed, with impacts.
 
@@ -218,9 +214,8 @@ class Contact(AbstractPositionConstraint):
 
     def rounding(self, t: Scalar, q: PerDof, params: PyTree) -> Scalar:
         """Rounding error of the gap due to coordinates and time, without derivatives."""
-        t, q, params = jax.lax.stop_gradient((t, q, params))
-        by_t, by_q = jax.grad(lambda t, q: self.error(t, q, params)[0], (0, 1))(t, q)
-        return _ROUNDING * float(jnp.finfo(q.dtype).eps) * (jnp.abs(by_t * t) + jnp.sum(jnp.abs(by_q * q)))
+        params = jax.lax.stop_gradient(params)
+        return rounding_of(lambda t, q: self.error(t, q, params), t, q, least=(0.0, 0.0))[0]
 
     def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
         """Check that the gap is one number."""

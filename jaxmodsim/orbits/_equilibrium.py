@@ -173,8 +173,9 @@ def prepare_rest(
             f"equilibrium does not support switches, but the scene has {', '.join(scene.switches)}: replace each by the"
             " force of one side, as an AppliedForce."
         )
-    numbers, rows = sum(scene.mode_widths(dof)), _rows_of(scene, dof)
-    mode, sides = jnp.zeros(numbers) if numbers else None, jnp.zeros(numbers - len(scene.contacts))
+    numbers, rows = scene.num_modes(dof), _rows_of(scene, dof)
+    mode = jnp.zeros(numbers) if numbers else None
+    sides = scene.split_modes(jnp.zeros(numbers))[0]
     if mode is not None and sides.size:
         t = jnp.zeros(())
         slip = from_dynamics(

@@ -96,7 +96,7 @@ class Dynamics(NamedTuple):
     """Accelerations and forces at one state, see `forward_dynamics`.
 
     - `t`, `y`, `mode`: time, state and modes.
-    - `scene`: the scene with its signals and laws at this state.
+    - `scene`: the scene with its signals and laws at this state; `unbound`: with those of all states.
     - `actions`: actions of all effects, by name.
     - `qdd`: accelerations.
     - `elements`, `friction`: the friction elements that depend on accelerations, and their forces, or None.
@@ -109,6 +109,7 @@ class Dynamics(NamedTuple):
     y: State
     mode: Modes
     scene: Scene
+    unbound: Scene
     actions: dict[str, Action]
     qdd: PerDof
     elements: FrictionElements | None
@@ -190,9 +191,11 @@ class Dynamics(NamedTuple):
 
         The guard of an open contact is its gap, that of a closed one its multiplier. A gap closes only below zero by
         more than its rounding, because it starts from zero after an impact and when a contact opens. The guard of a
-        switch is multiplied by its mode. The values of the guards at their events come third: rounding, or zero.
+        switch is multiplied by its mode, as is a kink. The values of the guards at their events come third: rounding,
+        or zero.
         """
         friction, gaps, sides = self._modes
+        state = self.t, self.y.q, self.y.qd
         guards, atol, roots = [], [], []
         if friction.size:
             assert self.friction is not None
@@ -207,11 +210,12 @@ class Dynamics(NamedTuple):
             atol.append(jnp.where(gaps > 0, 0.0, tolerances[1] + rounding))
             roots.append(jnp.where(gaps > 0, 0.0, rounding))
         if sides.size:
-            switches = self.scene.switches.values()
-            values = [each.value(self.t, self.y.q, self.y.qd, self.scene.params) for each in switches]
-            guards.append(sides * jnp.stack(values))
-            atol.append(jnp.zeros_like(sides))
-            roots.append(jnp.zeros_like(sides))
+            kinks, none = self.scene.num_kinks, jnp.zeros_like(sides)
+            # Kinks have the rounding of their numbers as a hysteresis, as they may stay near zero.
+            rounding = none.at[sides.size - kinks :].set(self.unbound.kink_rounding(*state, rest)) if kinks else none
+            guards.append(sides * self.unbound.side_values(*state) + rounding)
+            atol.append(rounding)
+            roots.append(rounding)
         return tuple(jnp.concatenate(each) for each in (guards, atol, roots))
 
     def start_friction(self, rest: Scalar) -> tuple[State, Float[Array, " n"]]:
@@ -309,7 +313,7 @@ class Dynamics(NamedTuple):
 
     @property
     def _modes(self) -> tuple[Array, Array, Array]:
-        """Modes of the friction elements, the contacts and the switches."""
+        """Modes of the friction elements, of the contacts, and of switches and kinks."""
         return self.scene.split_modes(self.mode)
 
     @property
@@ -372,7 +376,7 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
 
     The `Dynamics` at this state: accelerations `qdd`, shape `[dof]`, forces, reactions, powers and guards.
     """
-    q, qd = y.q, y.qd
+    q, qd, unbound = y.q, y.qd, scene
     scene = scene.bind_state(t, q, qd)
     params = scene.params
     rhs, mobility = load_and_mobility(scene, scene.constraints_in(mode), t, q, qd)
@@ -381,8 +385,9 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
     if compliant is not None:
         rhs = rhs + compliant.generalised
     sides = {}
-    if scene.switches and mode is not None:
-        sides = dict(zip(scene.switches, jax.lax.stop_gradient(scene.split_modes(mode)[2]), strict=True))
+    if mode is not None:
+        values = jax.lax.stop_gradient(scene.split_modes(mode)[2])
+        sides, scene = dict(zip(scene.switches, values, strict=False)), scene.on_sides(values)
     for name, effect in zip(scene.names, scene.effects, strict=True):
         if name in scene.event_driven or name in scene.reaction_loaded:
             continue
@@ -412,7 +417,7 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
             multipliers = multipliers + compliant.force
             reported = linearized._replace(rows=linearized.rows + compliant.rate)
     if not directions:
-        return Dynamics(t, y, mode, scene, actions, moves, None, None, reported, multipliers, None)
+        return Dynamics(t, y, mode, scene, unbound, actions, moves, None, None, reported, multipliers, None)
 
     qdd, minv_jt = moves[:, 0], moves[:, 1:].T
     along, loads, rounding = jnp.concatenate(directions), None, None
@@ -436,7 +441,7 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
     if multipliers is not None and yields is not None:
         multipliers = multipliers - apply_matrix(yields, solved.force)
     uniqueness = solved.margin if scene.loaded else None
-    return Dynamics(t, y, mode, scene, actions, qdd, elements, solved, reported, multipliers, uniqueness)
+    return Dynamics(t, y, mode, scene, unbound, actions, qdd, elements, solved, reported, multipliers, uniqueness)
 
 
 def _loads(

@@ -52,14 +52,14 @@ _constant = jax.lax.stop_gradient
 def mode_numbers(modes: Float[Array, "*time modes"], widths: tuple[int, ...]) -> Float[Array, "*time things"]:
     """Modes as one number for each thing: a sign, or for a plane 1 in slip and 0 in stick.
 
-    `widths` says how many numbers the mode of each thing has.
+    `widths` says how many numbers the mode of each thing has; those after these are left out.
 
     **Returns:**
 
     The numbers, shape `[time, things]`, floating like `modes`.
     """
     if all(width == 1 for width in widths):
-        return modes
+        return modes[..., : len(widths)]
     stops = list(accumulate(widths))
     parts = [modes[..., stop - width : stop] for stop, width in zip(stops, widths, strict=True)]
     return jnp.stack([x[..., 0] if x.shape[-1] == 1 else jnp.any(x != 0, axis=-1) * 1.0 for x in parts], axis=-1)

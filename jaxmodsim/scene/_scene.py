@@ -10,12 +10,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from .._core.arrays import PerDof, Scalar
 from .._core.functions import as_function
 from .._core.parameters import as_real, is_weak
 from .._core.readable import AbstractReadable
+from .._core.safe import rounding_of
 from ..friction import AbstractLaw
 from ..mechanics import AbstractConstraint, AbstractEquations, BoundContact, Contact, Lagrangian, Poisson
 from ._coordinates import as_coordinates, read_label
@@ -287,11 +288,34 @@ class Scene(AbstractReadable, eqx.Module):
         """Names of the things with a mode, in the order of the modes: event-driven friction, contacts, switches."""
         return (*self.event_driven, *self.contacts, *self.switches)
 
+    @property
+    def num_kinks(self) -> int:
+        """Number of kinks, see `side_values`, whose signs follow the modes of `mode_names` in an array of modes."""
+        return sum(each.num_kinks for each in self.event_driven.values())
+
     def split_modes(self, modes: Array) -> tuple[Array, Array, Array]:
-        """An array over the modes in three parts: of the friction elements, of the contacts, and of the switches."""
-        end = modes.shape[0] - len(self.switches)
+        """An array over the modes in three parts: of the friction elements, of the contacts, of switches and kinks."""
+        end = modes.shape[0] - len(self.switches) - self.num_kinks
         start = end - len(self.contacts)
         return modes[:start], modes[start:end], modes[end:]
+
+    def num_modes(self, dof: int) -> int:
+        """Number of entries of all modes, those of kinks included."""
+        return sum(self.mode_widths(dof)) + self.num_kinks
+
+    def side_values(self, t: Scalar, q: PerDof, qd: PerDof) -> Float[Array, " sides"]:
+        """Guards of the switches; then kinks: zeros of these numbers end a step, as friction has a kink there."""
+        params = self.bind_time(t).params
+        return jnp.stack([*(each.value(t, q, qd, params) for each in self.switches.values()), *self._kinks(t, q, qd)])
+
+    def kink_rounding(self, t: Scalar, q: PerDof, qd: PerDof, rest: Scalar) -> Float[Array, " kinks"]:
+        """Rounding errors of the kinks, constant; at least those of the changes `rest` of q and qd."""
+        held = jax.lax.stop_gradient(self)
+        return rounding_of(lambda *at: jnp.stack(held._kinks(*at)), t, q, qd, least=(0.0, rest, rest))
+
+    def _kinks(self, t: Scalar, q: PerDof, qd: PerDof) -> list[Scalar]:
+        params = self.bind_time(t).params
+        return [x for each in self.event_driven.values() for x in each.kinks(t, q, qd, params)]
 
     def mode_widths(self, dof: int) -> tuple[int, ...]:
         """Number of entries of each mode: one, or for friction in a plane that of the components of slip."""
@@ -374,6 +398,17 @@ class Scene(AbstractReadable, eqx.Module):
         if all(a is b for a, b in zip(effects, self.effects, strict=True)):
             return self
         return eqx.tree_at(lambda scene: scene.effects, self, effects)
+
+    def on_sides(self, sides: Float[Array, " sides"]) -> "Scene":
+        """The scene with these signs of its kinks, the last of `sides`; itself without kinks."""
+        if not self.num_kinks:
+            return self
+        effects, at = [], len(self.switches)
+        for each in self.effects:
+            if isinstance(each, Friction) and each.num_kinks:
+                each, at = each.on_sides(sides[at : at + each.num_kinks]), at + each.num_kinks
+            effects.append(each)
+        return dataclasses.replace(self, effects=tuple(effects))
 
     def initial_state(self, q: PerDof) -> dict[str, PyTree]:
         """State of each effect with a state of its own, at rest, by name."""

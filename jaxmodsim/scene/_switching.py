@@ -32,8 +32,9 @@ def start(
     slips, closed, sides = scene.split_modes(mode)
     if scene.contacts:
         closed = _start_contacts(t, y, scene, rest)
-    if scene.switches:
-        sides = _start_switches(t, y, scene, jnp.concatenate([jnp.zeros_like(slips), closed, jnp.ones_like(sides)]))
+    if sides.size:
+        above = jnp.ones_like(sides).at[len(scene.switches) :].set(0.0)
+        sides = _start_sides(t, y, scene, jnp.concatenate([jnp.zeros_like(slips), closed, above]))
     if scene.event_driven:
         begun = _join(jnp.zeros_like(slips), closed, sides)
         y, slips = from_dynamics(lambda d: d.start_friction(rest), t, y, scene, begun)
@@ -51,14 +52,10 @@ def _start_contacts(t: Scalar, y: State, scene: Scene, rest: Scalar) -> Float[Ar
     return jnp.where(jnp.stack(closed), 1.0, jnp.zeros_like(y.q[0]))
 
 
-def _start_switches(t: Scalar, y: State, scene: Scene, mode: Float[Array, " modes"]) -> Float[Array, " switches"]:
-    """Sides of the guards; a guard of zero has the side of its rate."""
-    rate, params = vector_field(t, y, scene, mode), scene.bind_time(t).params
-
-    def guards(t: Array, q: Array, qd: Array) -> Array:
-        return jnp.stack([each.value(t, q, qd, params) for each in scene.switches.values()])
-
-    value, pace = jax.jvp(guards, (t, y.q, y.qd), (jnp.ones_like(t), rate.q, rate.qd))
+def _start_sides(t: Scalar, y: State, scene: Scene, mode: Float[Array, " modes"]) -> Float[Array, " sides"]:
+    """Sides of switches and kinks; a value of zero has the side of its rate."""
+    rate = vector_field(t, y, scene, mode)
+    value, pace = jax.jvp(scene.side_values, (t, y.q, y.qd), (jnp.ones_like(t), rate.q, rate.qd))
     return jnp.where(jnp.where(value == 0, pace, value) >= 0, 1.0, -jnp.ones_like(value))
 
 
@@ -94,7 +91,7 @@ def switch(
     slips, closed, sides = scene.split_modes(mode)
     slip_fired, contact_fired, side_fired = scene.split_modes(fired)
     held = slip_fired & dense if holds else None
-    if scene.switches:
+    if sides.size:
         sides = jnp.where(side_fired, -sides, sides)
     if not scene.contacts:
         if slips.size:

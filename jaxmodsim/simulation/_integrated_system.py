@@ -205,13 +205,13 @@ class RunFunctions(eqx.Module):
         if scene.contacts:  # a contact may have closed; the derivative, too, or the next step would move it
             after = self.project(t, after, scene, touching)
         # Without an impact or another mode only rounding has changed: a sample of an input in stick is no event.
-        changed = jnp.any(mode != s.mode)
+        changed = jnp.any(self.event_mode(mode) != self.event_mode(s.mode))
         if scene.contacts:
             changed |= jnp.any(scene.split_modes(fired)[1]) & jnp.any(state.qd != before.qd)
         return s._replace(y=jtu.tree_map(lambda a, b: jnp.where(changed, a, b), after, s.y), mode=mode)
 
     def event_mode(self, mode: Array) -> Array:
-        """The parts of the modes that an event changes: without the reference velocities of planes."""
+        """The parts of the modes that an event changes: without the reference velocities of planes, and kinks."""
         return mode_numbers(mode, self.widths)
 
     def _stick(self, t: Array, s: EventState, scene: Scene) -> EventState:

@@ -127,6 +127,7 @@ def _solver(
     if signals_of(scene.params):
         freeze_args = _step_from
         samples = SampledJumps(freeze_args, sample_times(scene.params, linear=False))
+    dof = request.q0.shape[0]
     if scene.mode_names:
         return EventSolver(
             solver,
@@ -139,7 +140,7 @@ def _solver(
             dtmin=request.shortest_step,
             enforce=True,
             at_event=functions.derivative_and_guards,
-            event_mode=functions.event_mode if sum(functions.widths) > len(functions.widths) else None,
+            event_mode=functions.event_mode if scene.num_modes(dof) > len(scene.mode_names) else None,
             max_events=request.choices.max_events,
             log=request.choices.log,
         )
@@ -217,7 +218,7 @@ def _start(request: RunRequest, functions: RunFunctions, order: Any) -> _Start:
     scene, t0, exact = request.scene, request.t0, bool(request.scene.mode_names)
     initial = request.initial_state
     check_scene(scene, initial)
-    mode = jnp.zeros(sum(scene.mode_widths(request.q0.shape[0])), request.q0.dtype) if exact else None
+    mode = jnp.zeros(scene.num_modes(request.q0.shape[0]), request.q0.dtype) if exact else None
     if functions.projects:
         initial = project(t0, initial, scene.bind_time(t0), mode)
     y0 = functions.system.start(t0, initial, scene, mode)

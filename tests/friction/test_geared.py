@@ -58,7 +58,7 @@ def test_efficiency_in_steady_motion(direction: float, load: float) -> None:
     speed = direction * SPEED
     scene = joint(Geared(Coulomb(0.0), DRIVE, spring, BACK), u, load=load)
     state = State(jnp.array([load / 20.0, 0.0]), jnp.array([speed, speed]), {})
-    rate = rate_of(0.0, state, scene, np.array([direction]))
+    rate = rate_of(0.0, state, scene, np.array([direction, np.sign(load)]))
     np.testing.assert_allclose(rate.qd, 0.0, atol=1e-12)
     motor, other = u * speed, load * speed
     efficiency = other / motor if drives else motor / other
@@ -343,3 +343,50 @@ def test_coefficients_of_zero_have_the_derivative_of_growth(torques: tuple[float
 def test_wrong_published_names_are_refused() -> None:
     with pytest.raises(ValueError, match=r"actuators mx64, mx106, .* models M1, .* but 'mx64' and 'M7' were given"):
         ServoGear.published("mx64", "M7", 1.0, 1.0)
+
+
+def test_derivatives_over_zeros_of_the_torque_equal_differences_in_single_precision() -> None:
+    def end(x: Any, **options: Any) -> Any:
+        k, w, drive = x
+        scene = joint(Geared(Coulomb(jnp.full_like(k, 0.05)), drive, spring, BACK), 2.0, w=w, c=0.3, load=0.0)
+        scene = eqx.tree_at(lambda x: (x.params["k"], x.params["J1"], x.params["J2"]), scene, (k, 0.0 * k + 0.5, k / k))
+        scene = jax.tree.map(lambda leaf: jnp.asarray(leaf, k.dtype), scene)
+        run = jms.simulate(scene, 0.0 * k[None] * jnp.ones(2, k.dtype), jnp.zeros(2, k.dtype), 6.0, **options)
+        return jnp.concatenate([run.q[-1], run.qd[-1]]), run.stats["num_events"]
+
+    x = np.array([30.0, 2.0, 0.2])
+    slopes, events = jax.jacfwd(end, has_aux=True)(jnp.asarray(x, jnp.float32))
+    tight = jax.jit(lambda x: end(x, rtol=1e-11, atol=1e-13)[0])
+    exact = np.stack([(tight(x + h) - tight(x - h)) / 2e-5 for h in 1e-5 * np.eye(3)], axis=1)
+    assert int(events) == 6
+    np.testing.assert_allclose(
+        np.asarray(slopes) / np.abs(exact).max(axis=0), exact / np.abs(exact).max(axis=0), atol=1e-3
+    )
+
+
+def test_a_jump_of_the_quadratic_terms_is_in_the_derivative() -> None:
+    """Torques `p t` and -1 on a mass of 1 in slip: the friction jumps from Kmq to Keq at `t = 1/p`."""
+
+    def kinetic(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del t, q, p
+        return 0.5 * qd[0] ** 2
+
+    def motor(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del q, qd
+        return p["p"] * t
+
+    def push(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        return (motor(t, q, qd, p) - 1.0) * jnp.ones_like(q)
+
+    def speed(x: Any) -> Any:
+        law = ServoGear(motor, -1.0, Kc=0.1, Kv=0.0, Kcs=0.2, vs=1e6, Kmq=x[1], Keq=x[2])
+        scene = jms.Scene(kinetic, {"p": x[0]}, (jms.AppliedForce(push), jms.Friction(law)))
+        return jms.simulate(scene, [0.0], [5.0], 3.0, rtol=1e-9, atol=1e-11).qd[-1, 0]
+
+    def exact(x: Any) -> Any:
+        p, Kmq, Keq = x
+        return 5.0 + 4.5 * p - 3.0 - 0.9 - Kmq / (3.0 * p) - Keq * (3.0 - 1.0 / p)
+
+    x = jnp.array([0.8, 0.2, 0.05])
+    assert speed(x) == pytest.approx(float(exact(x)), abs=1e-9)
+    np.testing.assert_allclose(jax.jacfwd(speed)(x), jax.jacfwd(exact)(x), atol=1e-8)

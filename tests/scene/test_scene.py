@@ -29,7 +29,7 @@ from jaxmodsim import (
 )
 from jaxmodsim._core.compat import ClosedJaxpr
 from jaxmodsim._core.scalarise import in_scalars
-from jaxmodsim.scene import State, quantity_of, scene_ranges, vector_field
+from jaxmodsim.scene import AbstractEffect, State, quantity_of, scene_ranges, vector_field
 from jaxmodsim.simulation import named_series
 
 
@@ -395,3 +395,14 @@ def test_only_a_dead_zone_brings_the_holding_force() -> None:
     # then of the free acceleration along the one coordinate held, of its response to a force, and of the holding force.
     assert pivots_and_quotients(Sign(Coulomb(1.0))) == (2, 4)
     assert pivots_and_quotients(DeadZone(Coulomb(1.0), 1e-3)) == (2, 7)
+
+
+@pytest.mark.parametrize("name", ["inital_state", "Power", "store_energy", "chek"])
+def test_a_misspelled_method_of_an_effect_is_refused(name: str) -> None:
+    meant = {"inital_state": "initial_state", "Power": "power", "store_energy": "stored_energy", "chek": "check"}[name]
+    with pytest.raises(TypeError, match=rf"Own\.{name} is no method of AbstractEffect\. Did you mean '{meant}'\?"):
+        type("Own", (AbstractEffect,), {name: lambda self: None})
+
+
+def test_other_methods_of_an_effect_are_its_own() -> None:
+    type("Own", (AbstractEffect,), {"pressure": lambda self: None, "act_on": lambda self: None})

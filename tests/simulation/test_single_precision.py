@@ -209,3 +209,32 @@ def test_derivatives_of_a_clutch_whose_slip_is_rounding() -> None:
     assert found[2].all()
     np.testing.assert_allclose(found[0], exact[0], atol=2e-3)
     np.testing.assert_allclose(found[1], exact[1], rtol=0.05, atol=0.01)
+
+
+def test_a_slip_that_nearly_stays_ends_at_its_root() -> None:
+    """Two bodies near the speed V, with the slip `(t - 1)^2 - depth`: it ends at `1 - sqrt(depth)`."""
+
+    def kinetic(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del t, q, p
+        return 0.5 * jnp.sum(qd**2)
+
+    def drive(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del q, qd
+        return jnp.stack([2.0 * (t - 1.0) + p["F"], -p["F"]])
+
+    def slip(q: Any) -> Any:
+        return q[0] - q[1]
+
+    def first(case: Any) -> Any:
+        V, depth = case
+        rubs = jms.Friction(jms.Coulomb(F(0.05)), along=slip)
+        scene = jms.Scene(kinetic, {"F": F(0.05)}, (jms.AppliedForce(drive), rubs))
+        start = jnp.stack([V + 1.0 - depth, V])
+        run = jms.simulate(scene, np.zeros(2, F), start, F(1.5), throw=False, record=("events",), max_events=8)
+        return run.events.t[0], run.result.code
+
+    # Depths above the rounding of the slip, 1e-6 V.
+    cases = np.array([(V, d) for V in (0.0, 7.0, 100.0) for d in (1e-2, 1e-3, 3e-5) if d > 3e-7 * V], F)
+    t, code = jax.jit(lambda cases: jax.lax.map(first, cases))(cases)
+    assert not np.any(code)
+    np.testing.assert_allclose(t, 1.0 - np.sqrt(cases[:, 1]), atol=1e-3)

@@ -82,7 +82,7 @@ _switch = jax.jit(lambda *instant: switch(*instant, dense=jnp.zeros((), bool), h
 
 def first_modes(t: Array, y: State, scene: Scene) -> tuple[State, Float[Array, " modes"]]:
     """State and modes at the beginning of a run."""
-    mode = jnp.zeros(len(scene.mode_names), y.q.dtype)
+    mode = jnp.zeros(scene.num_modes(y.q.shape[0]), y.q.dtype)
     return start(t, y, scene, mode, jnp.asarray(_REST, y.q.dtype))
 
 

@@ -1,7 +1,6 @@
 """Base class of effects, which are forces on the mechanism."""
 
 import abc
-import difflib
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import equinox as eqx
@@ -9,6 +8,7 @@ import jax.numpy as jnp
 from equinox import AbstractVar
 from jaxtyping import Array, Float, PyTree
 
+from ..._core.arguments import nearest
 from ..._core.arrays import PerDof, Scalar
 
 
@@ -75,9 +75,9 @@ class AbstractEffect(eqx.Module):
         super().__init_subclass__(**options)
         known = [name for name in vars(AbstractEffect) if not name.startswith("_")]
         for name, value in vars(cls).items():
-            near = difflib.get_close_matches(name.lower(), known, 1, cutoff=0.85)
+            near = nearest(name.lower(), known, 0.85)
             if near and name not in known and (callable(value) or isinstance(value, property)):
-                raise TypeError(f"{cls.__name__}.{name} is no method of AbstractEffect. Did you mean {near[0]!r}?")
+                raise TypeError(f"{cls.__name__}.{name} is no method of AbstractEffect. Did you mean {near!r}?")
 
     def bind_state(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> "AbstractEffect":
         """The effect with its parameters at a state of the mechanism; itself if none of them depends on the state."""

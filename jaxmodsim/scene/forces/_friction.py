@@ -303,6 +303,27 @@ class Friction(AbstractEffect, AbstractRanged):
         load = jnp.asarray(fn(t, q, qd, params) if callable(fn) else fn)
         return jnp.where(load < 0, 0.0, load)  # the derivative of `maximum` at zero is a half
 
+    @property
+    def num_kinks(self) -> int:
+        """Number of `kinks`; zero if the law does not run by events."""
+        return sum(len(law.kinks) for law in self._kinked) if self.event_driven else 0
+
+    def kinks(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> list[Scalar]:
+        """Numbers at whose zeros the force has a kink, such as the torques of gears [N m]."""
+        laws = self.bind_state(t, q, qd, params)._kinked
+        return [jnp.asarray(kink(law), q.dtype) for law in laws for kink in law.kinks]
+
+    def on_sides(self, sides: Float[Array, " kinks"]) -> "Friction":
+        """The element with these signs of its kinks, so that its force is smooth where they change."""
+        stops = np.cumsum([len(law.kinks) for law in self._kinked])[:-1]
+        parts = jnp.split(sides, stops)
+        return eqx.tree_at(lambda x: [law.sides for law in x._kinked], self, parts, is_leaf=lambda x: x is None)
+
+    @property
+    def _kinked(self) -> list[Any]:
+        """The laws with kinks, within others, too."""
+        return [x for _, x in modules_of(self.law) if isinstance(x, AbstractSetValuedLaw) and x.kinks]
+
     def apply_force(self, q: PerDof, force: Float[Array, "..."], params: PyTree) -> PerDof:
         """Generalised force of the friction force `force`."""
         if self.along is None:

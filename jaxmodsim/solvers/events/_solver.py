@@ -123,7 +123,8 @@ class EventSolver(AbstractSolverWrapper):
     - `guards`: `guards(t, s, args)` -> shape `[guards]`; `s` is an `EventState` with your `s.y` and `s.mode`. Or a
       tuple of that and two arrays of the same shape: the error that each guard may have beside `rtol` of its magnitude,
       and its value at its event. The guard fires at zero, below that value, so that rounding does not fire it again;
-      times in between have the state after the event.
+      times in between have the state after the event. If that value is less than the error, the guard may also fire
+      before it, within the resolution of time.
     - `reset`: `reset(t, s, args, fired)` -> `s` with another `y` or `mode` (by `s._replace`); `fired` are booleans,
       shape `[guards]`.
     - `carries_on`: whether the run goes on where events accumulate, which `reset` finds in `s.dense`.
@@ -277,7 +278,7 @@ class EventSolver(AbstractSolverWrapper):
         unit = opaque_one(length)
         eps = float(jnp.finfo(length.dtype).eps)
         resolution = jnp.maximum(4.0 * eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1)), _constant(jnp.asarray(self.dtmin)))
-        seen, end, root = self._look(path, (t0, t1), y0._replace(y=y1), memory, args, resolution)
+        seen, *ends = self._look(path, (t0, t1), y0._replace(y=y1), memory, args, resolution)
         # At rest steps grow without limit, and their length says nothing about the motion after the event.
         measure = jnp.minimum(length, _GROW * memory.pace)
         jumps = None if self.samples is None else self.samples.at(t1, length)
@@ -285,7 +286,7 @@ class EventSolver(AbstractSolverWrapper):
         last = jnp.where(memory.resets == 0, memory.begin, y0.t)
         shortest = jnp.maximum(_SHORT * memory.pace, 2.0 * _constant(resolution))
         steps = jnp.maximum(measure, memory.pace), shortest
-        landing = self._land(seen, (end, root), (t1, length, resolution, last), steps, jumps)
+        landing = self._land(seen, ends, (t1, length, resolution, last), steps, jumps)
         next_root = fusion_barrier(landing.next_root, unit)
         landed = fusion_barrier(_flags(landing.landed, next_root), unit)
         landing = landing._replace(next_root=next_root, landed=landed > 0.5, happens=landed > 0.5)
@@ -295,6 +296,7 @@ class EventSolver(AbstractSolverWrapper):
         factor = jnp.maximum(factor, jnp.where(length <= shortest, 1.0, 0.0))
         report = StepReport(landed, landing.next_root, fusion_barrier(factor, unit))
         pace = jnp.maximum(measure, _FORGET_STEPS * memory.pace)
+        end, root, _ = ends
         at_end = y0._replace(y=y1, report=report), memory._replace(guard=end, armed=seen.armed, pace=pace)
         (state1, memory), (t_event, slope) = jax.lax.cond(
             landing.happens,
@@ -313,8 +315,8 @@ class EventSolver(AbstractSolverWrapper):
         memory: EventMemory,
         args: PyTree,
         resolution: Array,
-    ) -> tuple[GuardScan, Float[Array, " guards"], Float[Array, " guards"]]:
-        """Scan of the guards in a step that ends at `state`, their values there, and their values at events."""
+    ) -> tuple[GuardScan, Float[Array, " guards"], Float[Array, " guards"], Float[Array, " guards"]]:
+        """Scan of the guards in a step that ends at `state`, their values there, at events, and where they arrive."""
         t0, t1 = times
         places = [t0 + (t1 - t0) * part for part in (1 / 3, 1 / 2, 2 / 3)]
         # Constants, so that the guards have no derivative.
@@ -330,22 +332,23 @@ class EventSolver(AbstractSolverWrapper):
         tolerances = jnp.asarray(_constant(self.rtol), end.dtype), _constant(jnp.maximum(atol[0], atol[-1]))
         blur = _constant(resolution) / jnp.where(length > 0, length, 1.0)
         seen = scan_guards((memory.guard, one, two, end), middle, memory.armed, tolerances, blur, unit)
-        return seen, end, _constant(root[-1])
+        return seen, end, _constant(root[-1]), _constant(jnp.where(root[-1] < atol[-1], root[-1], 0.0))
 
     def _land(
         self,
         seen: GuardScan,
-        ends: tuple[Float[Array, " guards"], Float[Array, " guards"]],
+        ends: list[Float[Array, " guards"]],
         step: tuple[Array, Array, Array, Array],
         steps: tuple[Array, Array],
         jumps: Bool[Array, ""] | None,
     ) -> Landing:
         """Which guards fire at the end of a step, and the end of the next step.
 
-        `ends`: values of the guards there, and at events. `step`: its end, its length, the resolution of time and the
-        time of the last event. `steps`: the length of this or the last steps, and that of one that counts as none.
+        `ends`: values of the guards there, at events, and where they arrive. `step`: its end, its length, the
+        resolution of time and the time of the last event. `steps`: the length of this or the last steps, and that of
+        one that counts as none.
         """
-        (end, root), (t1, length, resolution, last), (longest, shortest) = ends, step, steps
+        (end, root, arrival), (t1, length, resolution, last), (longest, shortest) = ends, step, steps
         divisor, tiny = jnp.where(length > 0, length, 1.0), float(jnp.finfo(length.dtype).tiny)
 
         def landing(place: Array) -> Array:
@@ -359,7 +362,7 @@ class EventSolver(AbstractSolverWrapper):
         near = landing(jnp.ones_like(length))
         if jumps is not None:  # an event before a jump is another event
             near = jnp.where(jumps, _constant(resolution), near)
-        comes = arrives(seen, end, root, resolution / divisor)  # from as far as an instant
+        comes = arrives(seen, end, arrival, resolution / divisor)  # from as far as an instant
         near = jnp.where(comes, jnp.maximum(near, instant(resolution) / LATITUDE), near) / divisor
         # The cubic of a guard that has just fallen may be flat: within `root`, a rounding, it is at its root.
         here = (seen.armed & (jnp.abs(seen.ahead) <= near)) | (seen.crosses & (1.0 - seen.root <= near))
