@@ -27,7 +27,7 @@ APPLICATIONS = {
     "analysis": 2142,
     "orbits": 3137,
     "identify": 9681,
-    "sweeps": 2134,
+    "sweeps": 2102,
     "export": 2100,
     "control": 800,
     "problems": 2900,

@@ -1,6 +1,5 @@
 """The results of a sweep: variables, provenance, and their storage in memory or in a Zarr store that can be resumed."""
 
-import abc
 import contextlib
 import hashlib
 import importlib
@@ -192,58 +191,11 @@ def _value(x: object) -> object:
     return x.tolist() if x.size <= _SHORT else f"{x.shape} {x.dtype} {_digest(x)}"
 
 
-class AbstractResults(abc.ABC):
-    """Storage for the results of blocks, in any order; `_arrays` are the arrays of the variables by name."""
+class Results:
+    """Results of blocks, in any order, in a Zarr store or, without a path, in the memory of this process.
 
-    _layout: ResultLayout
-    _blocks: Blocks
-    _arrays: Any
-
-    @abc.abstractmethod
-    def done(self, block: int) -> np.ndarray | None:
-        """Codes of the runs of a stored block; None for a block that is not computed yet."""
-
-    def write(self, block: int, computed: Computed) -> None:
-        """Store the results of a block, one chunk of each variable, `result` last."""
-        place = self._blocks.place(block)
-        shape = tuple(along.stop - along.start for along in place)
-        values = {"num_steps": computed.num_steps, "result": computed.code} | computed.values
-        for variable in self._layout.variables:
-            self._arrays[variable.name][place] = values[variable.name].reshape(*shape, *variable.shape)
-
-    @abc.abstractmethod
-    def dataset(self) -> "xr.Dataset":
-        """All results."""
-
-
-class Memory(AbstractResults):
-    """Results in the memory of this process."""
-
-    def __init__(
-        self, layout: ResultLayout, blocks: Blocks, attrs: Mapping[str, object], provenance: dict[str, object]
-    ) -> None:
-        """Allocate the arrays."""
-        self._layout, self._blocks = layout, blocks
-        self._attrs = {**attrs, _ATTRIBUTE: json.dumps(provenance)}
-        self._arrays = {x.name: np.full((*layout.shape, *x.shape), x.fill, x.dtype) for x in layout.variables}
-
-    def done(self, block: int) -> np.ndarray | None:
-        """None: no block is stored beforehand."""
-        del block
-
-    def dataset(self) -> "xr.Dataset":
-        """All results."""
-        return extra("xarray").Dataset(
-            {x.name: ((*self._layout.dims, *x.dims), self._arrays[x.name], x.attrs) for x in self._layout.variables},
-            self._layout.coordinates,
-            self._attrs,
-        )
-
-
-class Store(AbstractResults):
-    """Results in a Zarr store, one chunk for each block and variable, each written whole or not at all.
-
-    The chunk of `result` is written last, and marks the block as stored.
+    A store has one chunk for each block and variable, each written whole or not at all. The chunk of `result` is
+    written last, and marks the block as stored.
 
     **Raises:**
 
@@ -253,25 +205,28 @@ class Store(AbstractResults):
 
     def __init__(
         self,
-        path: Path,
+        path: Path | None,
         layout: ResultLayout,
         blocks: Blocks,
         attrs: Mapping[str, object],
         provenance: dict[str, object],
     ) -> None:
-        """Create the store, or open it to resume."""
+        """Allocate arrays, create the store, or open it to resume."""
         self._path, self._layout, self._blocks = path, layout, blocks
-        provenance = json.loads(json.dumps(provenance))
+        self._attrs = {**attrs, _ATTRIBUTE: json.dumps(provenance)}
+        if path is None:
+            self._arrays = {x.name: np.full((*layout.shape, *x.shape), x.fill, x.dtype) for x in layout.variables}
+            return
         if path.exists():
-            _check_same(path, provenance)
+            _check_same(path, json.loads(self._attrs[_ATTRIBUTE]))
             for partial in path.rglob(_PARTIAL):
                 partial.unlink(missing_ok=True)
         else:
-            _create(path, layout, blocks, {**attrs, _ATTRIBUTE: json.dumps(provenance)})
-        self._arrays = extra("zarr").open_group(path, mode="r+")
+            _create(path, layout, blocks, self._attrs)
+        self._arrays: Any = extra("zarr").open_group(path, mode="r+")
 
     def done(self, block: int) -> np.ndarray | None:
-        """Codes of a block whose last chunk is stored."""
+        """Codes of the runs of a stored block; None for a block that is not computed yet."""
         try:
             codes = np.asarray(self._arrays["result"][self._blocks.place(block)])
         except (ValueError, RuntimeError) as error:
@@ -281,10 +236,23 @@ class Store(AbstractResults):
             ) from error
         return None if (codes == NOT_RUN).any() else codes
 
+    def write(self, block: int, computed: Computed) -> None:
+        """Store the results of a block, `result` last."""
+        place = self._blocks.place(block)
+        shape = tuple(along.stop - along.start for along in place)
+        values = {"num_steps": computed.num_steps, "result": computed.code} | computed.values
+        for variable in self._layout.variables:
+            self._arrays[variable.name][place] = values[variable.name].reshape(*shape, *variable.shape)
+
     def dataset(self) -> "xr.Dataset":
-        """All results, read on access."""
-        stored = extra("xarray").open_zarr(self._path, consolidated=False, chunks=None)
-        return stored[[x.name for x in self._layout.variables]]  # a store has no order of variables
+        """All results; those of a store are read on access."""
+        xarray, layout = extra("xarray"), self._layout
+        if self._path is None:
+            data = {x.name: ((*layout.dims, *x.dims), self._arrays[x.name], x.attrs) for x in layout.variables}
+            return xarray.Dataset(data, layout.coordinates, self._attrs)
+        stored = xarray.open_zarr(self._path, consolidated=False, chunks=None)
+        # A store has no order of variables, and does not mark coordinates that are no dimension.
+        return stored[[x.name for x in layout.variables]].assign_coords(layout.coordinates)
 
 
 def _check_same(path: Path, provenance: dict[str, object]) -> None:

@@ -23,7 +23,7 @@ from ._compute import GROUP, Task, Work, in_threads, run_on_executor, runs_per_c
 from ._grid import Blocks, blocks, grid
 from ._predict import predict_steps
 from ._request import Request, request_of
-from ._results import AbstractResults, Memory, Store, describe, layout, package_versions, provenance, solver_of
+from ._results import Results, describe, layout, package_versions, provenance, solver_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -183,8 +183,8 @@ def sweep(
             "made_by": f"jaxmodsim {package_versions()['jaxmodsim']}",
             "commit": commit(),
         }
-        origin = layout(request), cut, attrs, provenance(request, work, cut.extent)
-        results = Memory(*origin) if out is None else Store(Path(out), *origin)
+        path = None if out is None else Path(out)
+        results = Results(path, layout(request), cut, attrs, provenance(request, work, cut.extent))
         try:
             _run(request, work, cut, results, executor, chosen, report)
         except KeyboardInterrupt:
@@ -253,7 +253,7 @@ def _run(
     request: Request,
     work: Work,
     cut: Blocks,
-    results: AbstractResults,
+    results: Results,
     executor: object,
     devices: list[object],
     report: Progress | None,

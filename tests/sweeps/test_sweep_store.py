@@ -68,6 +68,13 @@ def test_a_store_holds_what_memory_would(whole: Path) -> None:
     assert list(store(whole).data_vars) == ["power", "waves", "num_steps", "result"]
 
 
+def test_numbers_that_change_together_are_coordinates_of_a_store(tmp_path: Path) -> None:
+    over = {"sample": {"a": [1.0, 2.0, 4.0], "b": [0.0, 0.5, 1.0]}}
+    stored, kept = store(tmp_path / "store.zarr", over=over), jms.sweep(curve, over)
+    xr.testing.assert_identical(stored.load().drop_attrs(), kept.drop_attrs())
+    assert set(stored.coords) == {"a", "b"}
+
+
 def test_an_interrupted_sweep_goes_on(whole: Path, tmp_path: Path) -> None:
     out = tmp_path / "store.zarr"
     for runs in (100, 500):
