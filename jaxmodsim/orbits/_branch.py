@@ -205,7 +205,7 @@ def follow(
     span: Sequence[float],
     longest: float,
     most: int,
-    grown: Callable[[], None] | None = None,
+    grown: Callable[[int, float], None] | None = None,
 ) -> str:
     """Add orbits and bifurcation points until the branch leaves the span; returns why it ends.
 
@@ -248,7 +248,7 @@ def follow(
             points += _bifurcations(now, after, length, len(steps) - 1)
         steps.append(after)
         if grown is not None:
-            grown()
+            grown(len(steps), after.shot.value)
         length = min(longest, 1.5 * length if count <= _EASY else length)
     return f"It ends at the limit of {most} orbits."
 

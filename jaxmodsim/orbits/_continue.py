@@ -114,9 +114,9 @@ def continue_orbits(
         steps, points = store.read(begin)
     with reported(progress, "branch", lambda count, value: f"{count} orbits, {parameter} = {value:.6g}") as report:
 
-        def grown() -> None:
+        def grown(count: int, value: float) -> None:
             if report is not None:
-                report(len(steps), steps[-1].shot.value)
+                report(count, value)
             if store is not None:
                 store.write_often(steps, points)
 
@@ -220,12 +220,7 @@ def continue_bifurcation(
     shot, _ = newton(problem, start.x, start.period, problem.values, dof, scale, conditions)
     steps = [step_at(problem, shot, describe(problem, shot, dof)[0], spans, sense, test)]
     with reported(progress, "curve", lambda count, value: f"{count} orbits, {other} = {value:.6g}") as report:
-
-        def grown() -> None:
-            if report is not None:
-                report(len(steps), steps[-1].shot.value)
-
-        ending = follow(steps, None, (first, last), longest, most, grown)
+        ending = follow(steps, None, (first, last), longest, most, report)
     values = np.array([each.shot.values for each in steps])
     return BifurcationCurve(point.kind, (one, other), values, tuple(each.orbit for each in steps), ending)
 

@@ -29,8 +29,8 @@ from ._orbit import ModeSequence, PeriodicOrbit, describe, floquet
 from ._return_map import OrbitError, OrbitProblem, ShotOrbit, evaluate
 from ._settle import held, magnitudes, states_of
 
-# A function of a problem, a shot, the scales of the unknowns, and the number of coordinates.
-Test: TypeAlias = Callable[[OrbitProblem, ShotOrbit, np.ndarray, int], float]
+# A function of the multipliers that are not exactly 1.
+Test: TypeAlias = Callable[[np.ndarray], float]
 
 # Step of finite differences, in the scales of the unknowns: the iteration needs few digits of the derivatives.
 _DIFFERENCE = 1e-6
@@ -100,7 +100,7 @@ class OrbitStep(AbstractStep[ShotOrbit, PeriodicOrbit]):
         """Test functions of the multipliers."""
 
         def value(test: Test, shot: ShotOrbit) -> float:
-            return test(self.problem, shot, self.scale, len(self.orbit.q))
+            return test(_multipliers(self.problem, shot, self.scale, len(self.orbit.q)))
 
         return {kind: partial(value, TESTS[kind]) for kind in (DOUBLING, TORUS, CROSSING)}
 
@@ -197,14 +197,17 @@ def step_at(
 def critical_condition(problem: OrbitProblem, test: Test, scale: np.ndarray, dof: int) -> Condition:
     """The condition that a test function is zero, with derivatives by finite differences."""
 
+    def value(shot: ShotOrbit) -> float:
+        return test(_multipliers(problem, shot, scale, dof))
+
     def by(shot: ShotOrbit) -> np.ndarray:
-        here, row = test(problem, shot, scale, dof), []
+        here, row = value(shot), []
         for moved in shot.unknowns + _DIFFERENCE * np.diag(scale):
             beside = evaluate(problem, *split(moved, shot, problem.autonomous), dof)
-            row.append((test(problem, beside, scale, dof) - here) / _DIFFERENCE)
+            row.append((value(beside) - here) / _DIFFERENCE)
         return np.array(row)
 
-    return Condition(lambda shot: test(problem, shot, scale, dof), by)
+    return Condition(value, by)
 
 
 def _multipliers(problem: OrbitProblem, shot: ShotOrbit, scale: np.ndarray, dof: int) -> np.ndarray:
@@ -212,18 +215,17 @@ def _multipliers(problem: OrbitProblem, shot: ShotOrbit, scale: np.ndarray, dof:
     return floquet(problem, shot, 0, scale[: shot.x.shape[1]], dof)
 
 
-def _doubling(problem: OrbitProblem, shot: ShotOrbit, scale: np.ndarray, dof: int) -> float:
-    return float(np.prod(_multipliers(problem, shot, scale, dof) + 1.0).real)
+def _crossing(multipliers: np.ndarray) -> float:
+    return float(np.prod(multipliers - 1.0).real)
 
 
-def _crossing(problem: OrbitProblem, shot: ShotOrbit, scale: np.ndarray, dof: int) -> float:
-    return float(np.prod(_multipliers(problem, shot, scale, dof) - 1.0).real)
+def _doubling(multipliers: np.ndarray) -> float:
+    return float(np.prod(multipliers + 1.0).real)
 
 
-def _torus(problem: OrbitProblem, shot: ShotOrbit, scale: np.ndarray, dof: int) -> float:
-    values = _multipliers(problem, shot, scale, dof)
-    i, j = np.triu_indices(len(values), 1)
-    return float(np.prod(values[i] * values[j] - 1.0).real) if len(i) else 1.0
+def _torus(multipliers: np.ndarray) -> float:
+    i, j = np.triu_indices(len(multipliers), 1)
+    return float(np.prod(multipliers[i] * multipliers[j] - 1.0).real)
 
 
 # Test functions, which are zero at bifurcations, by kind.
