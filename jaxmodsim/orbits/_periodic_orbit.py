@@ -2,7 +2,7 @@
 
 from __future__ import annotations  # `help` shows types as they are written here
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import equinox as eqx
@@ -145,7 +145,7 @@ def prepare(
     if isinstance(guess, PeriodicOrbit):
         phase = jax.lax.stop_gradient(guess.t0 / guess.period)
     number = (
-        period if period is None or callable(period) else _ConstantPeriod(as_float(period, name="period", lower=0.0))
+        period if period is None or callable(period) else MultipleOfPeriod(as_float(period, name="period", lower=0.0))
     )
     problem = OrbitProblem(scene, phase, relative, absolute, number, section, parameters)
     count = as_whole(segments, name="segments")
@@ -187,15 +187,16 @@ def _segment_starts(problem: OrbitProblem, states: State, count: int) -> Settled
     return cut(problem, runs, period, count)._replace(x=x, cuts=cuts)
 
 
-class _ConstantPeriod(eqx.Module):
-    """A period that does not depend on the parameters."""
+@dataclass(frozen=True)
+class MultipleOfPeriod:
+    """A multiple of a period, which is a number [s] or a function of the parameters."""
 
-    seconds: float
+    period: float | PeriodFn
+    factor: float = 1.0
 
-    def __call__(self, params: PyTree) -> float:
+    def __call__(self, params: PyTree) -> Array | float:
         """The period [s]."""
-        del params
-        return self.seconds
+        return self.factor * (self.period(params) if callable(self.period) else self.period)
 
 
 def _settle(problem: OrbitProblem, settle: float | None) -> float:

@@ -1,10 +1,7 @@
 """First orbits of branches that begin on another branch, at a period doubling or a Hopf point."""
 
-from dataclasses import dataclass
-
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PyTree
 
 from ..scene import Scene, replace_elements
 from ._branch import DOUBLING, HOPF, BifurcationPoint
@@ -13,7 +10,7 @@ from ._neutral import anchored
 from ._newton import Condition, newton
 from ._orbit import PeriodicOrbit, describe
 from ._orbit_step import OrbitStep, step_at
-from ._periodic_orbit import prepare
+from ._periodic_orbit import MultipleOfPeriod, prepare
 from ._rest import rest_at
 from ._return_map import OrbitError, OrbitProblem, PeriodFn, Section, SettledState, ShotOrbit, pack
 
@@ -51,7 +48,7 @@ def first_step(
         )
     at_point, length = replace_elements(scene, {parameter: point.value}), abs(span[1] - span[0])
     if isinstance(orbit, PeriodicOrbit):
-        doubled = None if period is None else _TwicePeriod(period)
+        doubled = None if period is None else MultipleOfPeriod(period, 2.0)
         problem, start, dof = prepare(at_point, orbit, doubled, section, None, rtol, atol, (parameter,))
         return _doubled(problem, start, point, length, dof)
     if period is not None or section is not None:
@@ -76,17 +73,6 @@ def _doubled(
     shot = newton(problem, start.x, twice, np.array([point.value]), dof, scale)[0]
     at_point = OrbitStep(problem, shot, point.orbit, scale, tangent)
     return at_point.moved_to(at_point.corrected(_BESIDE)[0])
-
-
-@dataclass(frozen=True)
-class _TwicePeriod:
-    """Twice a period."""
-
-    period: float | PeriodFn
-
-    def __call__(self, params: PyTree) -> Array | float:
-        """Twice the period [s]."""
-        return 2.0 * (self.period(params) if callable(self.period) else self.period)
 
 
 def _at_hopf_point(
