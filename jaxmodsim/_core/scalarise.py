@@ -142,7 +142,8 @@ def _entries(shape: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
     return itertools.product(*map(range, shape))
 
 
-def _array(shape: tuple[int, ...], entry: Callable[[tuple[int, ...]], Value]) -> Parts:
+def array_of(shape: tuple[int, ...], entry: Callable[[tuple[int, ...]], Value]) -> Parts:
+    """An array of scalars from a function of the index."""
     out = np.empty(shape, object)
     for index in _entries(shape):
         out[index] = entry(index)
@@ -187,10 +188,10 @@ class AbstractScalars(abc.ABC):
         if is_apart(x):
             return x
         if isinstance(x, np.ndarray):
-            return _array(x.shape, lambda index: x[index])
+            return array_of(x.shape, lambda index: x[index])
         if id(x) not in self.memory:
             entries = iter(jnp.unstack(jnp.reshape(x, -1)))
-            self.memory[id(x)] = x, _array(x.shape, lambda _: next(entries))
+            self.memory[id(x)] = x, array_of(x.shape, lambda _: next(entries))
         return self.memory[id(x)][1]
 
     def run(self, jaxpr: Jaxpr, consts: Sequence[ArrayLike], args: Sequence[Value]) -> list[Value]:
@@ -214,10 +215,8 @@ class AbstractScalars(abc.ABC):
         if not all(self.divides(kind.size) for kind in kinds):
             return self.whole(eqn, inputs)
         if name in _ELEMENTWISE:
-            arrays = np.broadcast_arrays(*map(self.parts, inputs))
-            return [
-                _array(arrays[0].shape, lambda i: self.apply(eqn.primitive.bind, name, params, [x[i] for x in arrays]))
-            ]
+            arrays, compute = np.broadcast_arrays(*map(self.parts, inputs)), eqn.primitive.bind
+            return [array_of(arrays[0].shape, lambda i: self.apply(compute, name, params, [x[i] for x in arrays]))]
         if name in _MOVES:
             return [_MOVES[name](params, *map(self.parts, inputs))]
         if name == "split":
@@ -253,7 +252,7 @@ class AbstractScalars(abc.ABC):
         axes = params["axes"]
         x = np.moveaxis(x, axes, range(len(axes)))
         x = x.reshape(-1, *x.shape[len(axes) :])
-        return _array(x.shape[1:], lambda i: functools.reduce(self.add, x[(slice(None), *i)]))
+        return array_of(x.shape[1:], lambda i: functools.reduce(self.add, x[(slice(None), *i)]))
 
     def cumsum(self, params: Params, x: Parts) -> Parts:
         step = -1 if params["reverse"] else 1
@@ -275,7 +274,7 @@ class AbstractScalars(abc.ABC):
             pairs = zip(left.flat, right.flat, strict=True)
             return functools.reduce(self.add, [self.apply(jax.lax.mul, "mul", {}, [x, y]) for x, y in pairs])
 
-        return _array((*a.shape[: batch + rows], *b.shape[batch : batch + columns]), entry)
+        return array_of((*a.shape[: batch + rows], *b.shape[batch : batch + columns]), entry)
 
 
 class _Scalars(AbstractScalars):
@@ -333,7 +332,7 @@ def _pad(params: Params, x: Parts, filling: Parts) -> Parts:
     shape = tuple(
         low + high + size + inner * max(size - 1, 0) for size, (low, high, inner) in zip(x.shape, config, strict=True)
     )
-    out = _array(shape, lambda _: filling[()])
+    out = array_of(shape, lambda _: filling[()])
     for i in _entries(x.shape):
         to = tuple(low + k * (inner + 1) for k, (low, _, inner) in zip(i, config, strict=True))
         if all(0 <= k < size for k, size in zip(to, shape, strict=True)):
@@ -355,7 +354,7 @@ def _slice(params: Params, x: Parts) -> Parts:
 
 def _iota(params: Params) -> Parts:
     shape, dimension = params["shape"], params["dimension"]
-    return _array(shape, lambda i: np.dtype(params["dtype"]).type(i[dimension]))
+    return array_of(shape, lambda i: np.dtype(params["dtype"]).type(i[dimension]))
 
 
 # Operations that move entries.

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from .._core.scalarise import trace_in_arrays
-from ._program import Assign, Block, Choice, Entry, Loop, Program, Symbol, program_of
+from ._program import Assign, Block, Choice, Entry, Loop, Symbol, program_of
 
 # Operands are names or literals.
 _FORMS = {
@@ -110,8 +110,11 @@ def write_function(
 
     entries = [[jnp.zeros((), x.dtype) for x in own] for own in symbols.values()]
     closed, shapes = trace_in_arrays(flat, *entries)
-    program = program_of(closed, list(itertools.chain(*symbols.values())))
-    return _program_lines(program, places([math.prod(x.shape) for x in shapes]))
+    program, text, indent = program_of(closed, list(itertools.chain(*symbols.values()))), _BlockText(), "  "
+    lines = text.block(program.block, indent)
+    for to, x in zip(places([math.prod(x.shape) for x in shapes]), program.results, strict=True):
+        lines.append(f"{indent}return {text.value(x)};" if to == "return" else f"{indent}{to} = {text.value(x)};")
+    return lines
 
 
 def unused(names: Iterable[str], lines: list[str]) -> list[str]:
@@ -136,14 +139,6 @@ def _filled(like: PyTree, entries: list[Array]) -> PyTree:
         array = jnp.stack(part) if part else jnp.zeros(0, np.asarray(leaf).dtype)
         leaves.append(array.reshape(np.shape(leaf)) if np.ndim(leaf) else part[0])
     return jtu.tree_unflatten(jtu.tree_structure(like), leaves)
-
-
-def _program_lines(program: Program, places: Sequence[str]) -> list[str]:
-    text, indent = _BlockText(), "  "
-    lines = text.block(program.block, indent)
-    for to, x in zip(places, program.results, strict=True):
-        lines.append(f"{indent}return {text.value(x)};" if to == "return" else f"{indent}{to} = {text.value(x)};")
-    return lines
 
 
 class _BlockText:

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from .._core.parameters import range_checks
@@ -59,16 +60,10 @@ class Model(NamedTuple):
 
     def linear(self, t: Array, p: Scene, y: State, m: Array) -> PyTree:
         """Rates, their derivative by time, and their Jacobian."""
-        flat, unravel = jnp.concatenate([jnp.ravel(x) for x in jtu.tree_leaves(y)]), jtu.tree_structure(y)
-        sizes = np.cumsum([np.size(x) for x in jtu.tree_leaves(y)])[:-1]
+        flat, unravel = ravel_pytree(y)
 
         def field(ty: Array) -> tuple[Array, Array]:
-            leaves = [
-                jnp.reshape(x, np.shape(like))
-                for x, like in zip(jnp.split(ty[1:], sizes), jtu.tree_leaves(y), strict=True)
-            ]
-            out = self.rate(ty[0], p, jtu.tree_unflatten(unravel, leaves), m)
-            out = jnp.concatenate([jnp.ravel(x) for x in jtu.tree_leaves(out)])
+            out, _ = ravel_pytree(self.rate(ty[0], p, unravel(ty[1:]), m))
             return out, out
 
         jacobian, rates = jax.jacfwd(field, has_aux=True)(jnp.concatenate([t[None], flat]))
@@ -87,11 +82,7 @@ class Model(NamedTuple):
     def pull(self, t: Array, p: Scene, y: State, m: Array, tol: Array, seed: Array) -> PyTree:
         """Adjoint derivative of `evaluate`."""
         out, transposed = jax.vjp(lambda t, p, y: self.evaluate(t, p, y, m, tol), t, p, y)
-        leaves, parts = jtu.tree_leaves(out), []
-        for leaf in leaves:
-            parts.append(jnp.reshape(seed[: np.size(leaf)], np.shape(leaf)))
-            seed = seed[np.size(leaf) :]
-        return transposed(jtu.tree_unflatten(jtu.tree_structure(out), parts))
+        return transposed(ravel_pytree(out)[1](seed))
 
     def guards(self, t: Array, p: Scene, y: State, m: Array, tol: Array) -> PyTree:
         """Guards, their tolerances, and their values at events."""

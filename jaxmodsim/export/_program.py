@@ -11,7 +11,7 @@ import numpy as np
 
 from .._core.compat import AVAILABLE, ClosedJaxpr, JaxprEqn, scan_counts
 from .._core.lu import is_constant
-from .._core.scalarise import AbstractScalars, AbstractSymbol, Params, Parts, Value, is_apart
+from .._core.scalarise import AbstractScalars, AbstractSymbol, Params, Parts, Value, array_of, is_apart
 
 _COMPARISONS = {"eq", "ne", "lt", "le", "gt", "ge", "is_finite"}
 _FOLDS = {"reduce_max": jax.lax.max, "reduce_min": jax.lax.min, "reduce_prod": jax.lax.mul}
@@ -99,21 +99,15 @@ def program_of(closed: ClosedJaxpr, arguments: Sequence[Symbol]) -> Program:
     results = [x for each in outputs for x in writer.parts(each).flat]
     # Results overwrite arguments: a result that is an argument itself is copied first.
     copied = [writer.assign("copy", [x]) if isinstance(x, Symbol) and x.name else x for x in results]
-    return Program(_needed(writer.block, set(filter(_is_symbol, copied))), copied)
+    return Program(_needed(writer.block, {x for x in copied if isinstance(x, Symbol)}), copied)
 
 
 def _scalar_array(x: Value) -> Parts:
-    out = np.empty((), object)
-    out[()] = x
-    return out
+    return array_of((), lambda _: x)
 
 
 def _one(dtype: np.dtype) -> np.generic:
     return dtype.type(1)
-
-
-def _is_symbol(x: object) -> bool:
-    return isinstance(x, Symbol)
 
 
 class _StatementWriter(AbstractScalars):
@@ -236,10 +230,11 @@ class _StatementWriter(AbstractScalars):
     def fold(self, compute: Callable[..., Any], name: str, axes: tuple[int, ...], x: Parts) -> Parts:
         x = np.moveaxis(x, axes, range(len(axes)))
         x = x.reshape(-1, *x.shape[len(axes) :])
-        out = np.empty(x.shape[1:], object)
-        for i in np.ndindex(*out.shape):
-            out[i] = functools.reduce(lambda a, b: self.apply(compute, name, {}, [a, b]), x[(slice(None), *i)])
-        return out
+
+        def entry(i: tuple[int, ...]) -> Value:
+            return functools.reduce(lambda a, b: self.apply(compute, name, {}, [a, b]), x[(slice(None), *i)])
+
+        return array_of(x.shape[1:], entry)
 
     def move(self, eqn: JaxprEqn, inputs: list[Value], known: Sequence[np.ndarray | None]) -> Parts:
         """The entries of the operands, rearranged as the operation rearranges their indices."""
@@ -253,18 +248,15 @@ class _StatementWriter(AbstractScalars):
             numbered.append(jnp.arange(len(entries), len(entries) + parts.size).reshape(parts.shape))
             entries += list(parts.flat)
         places = np.asarray(eqn.primitive.bind(*numbered, **eqn.params))
-        out = np.empty(places.shape, object)
-        for i in np.ndindex(*places.shape):
-            out[i] = entries[places[i]]
-        return out
+        return array_of(places.shape, lambda i: entries[places[i]])
 
     def choose(self, test: Parts, one: Parts, other: Parts) -> Parts:
         """`one` where `test`, which has the leading axes of both, is true, else `other`."""
-        out = np.empty(one.shape, object)
-        for i in np.ndindex(*out.shape):
-            chosen = test[i[: test.ndim]]
-            out[i] = self.apply(jax.lax.select_n, "select_n", {}, [chosen, other[i], one[i]])
-        return out
+
+        def entry(i: tuple[int, ...]) -> Value:
+            return self.apply(jax.lax.select_n, "select_n", {}, [test[i[: test.ndim]], other[i], one[i]])
+
+        return array_of(one.shape, entry)
 
     def argument(self, compute: Callable[..., Any], name: str, params: Params, x: Parts) -> Parts:
         """Index of the first of the smallest, or largest, entries along an axis."""
@@ -403,10 +395,7 @@ class _StatementWriter(AbstractScalars):
 
 def _symbols(like: np.ndarray, dtype: np.dtype | None = None) -> Parts:
     """New symbols with the types of these entries."""
-    out = np.empty(like.shape, object)
-    for i in np.ndindex(*like.shape):
-        out[i] = Symbol(like[i].dtype if dtype is None else dtype)
-    return out
+    return array_of(like.shape, lambda i: Symbol(like[i].dtype if dtype is None else dtype))
 
 
 def _known_array(x: Value) -> np.ndarray | None:
