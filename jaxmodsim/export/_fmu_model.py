@@ -1,5 +1,6 @@
 """The equations of a scene as C functions of flat arrays: rates, guards, events, outputs and their derivatives."""
 
+import inspect
 import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -24,6 +25,8 @@ _READ |= {x: f"const double *{x}" for x in ("p", "y", "m", "tol", "fired", "dp",
 
 class Model(NamedTuple):
     """A scene with the parts of an FMU.
+
+    The functions in C that `_routines` names have the arguments and the docstrings of their methods.
 
     - `scene`: the scene; `y`: its initial state.
     - `modes`: number of entries of all modes; `projects`: whether constraints or stick drift.
@@ -55,11 +58,11 @@ class Model(NamedTuple):
         return dynamics, observed
 
     def rate(self, t: Array, p: Scene, y: State, m: Array) -> PyTree:
-        """Rates."""
+        """Rates of the state."""
         return vector_field(t, y, p, self.modes_or_none(m))
 
     def linear(self, t: Array, p: Scene, y: State, m: Array) -> PyTree:
-        """Rates, their derivative by time, and their Jacobian."""
+        """Rates, their derivative by time, and their Jacobian by rows."""
         flat, unravel = ravel_pytree(y)
 
         def field(ty: Array) -> tuple[Array, Array]:
@@ -76,11 +79,11 @@ class Model(NamedTuple):
         return dynamics.rate, guards, list(outputs.values())
 
     def push(self, t: Array, p: Scene, y: State, m: Array, tol: Array, along: Array, dp: Scene, dy: State) -> PyTree:
-        """Directional derivative of `evaluate`."""
+        """Directional derivative of model_evaluate, along time, numbers and states."""
         return jax.jvp(lambda t, p, y: self.evaluate(t, p, y, m, tol), (t, p, y), (along, dp, dy))[1]
 
     def pull(self, t: Array, p: Scene, y: State, m: Array, tol: Array, seed: Array) -> PyTree:
-        """Adjoint derivative of `evaluate`."""
+        """Adjoint derivative of model_evaluate, by time, numbers and states."""
         out, transposed = jax.vjp(lambda t, p, y: self.evaluate(t, p, y, m, tol), t, p, y)
         return transposed(ravel_pytree(out)[1](seed))
 
@@ -105,7 +108,7 @@ class Model(NamedTuple):
         return forward_dynamics(t, y, p, m).stick(m) if p.stick_drifts else y
 
     def ranges(self, p: Scene) -> list[Array]:
-        """1 for each of the `requirements` that holds, else 0."""
+        """Whether each of the `requirements` holds, as 1 or 0."""
         return [jnp.where(holds, 1.0, 0.0) for _, holds in range_checks(p)]
 
     @property
@@ -114,14 +117,14 @@ class Model(NamedTuple):
         return [text for text, _ in range_checks(self.scene)]
 
     def begin(self, t: Array, p: Scene, tol: Array, y: State, m: Array) -> tuple[State, Array]:
-        """State and modes at the start of a run."""
+        """State and modes at the start."""
         y = self.on_constraints(t, p, y, jnp.zeros_like(m))
         return start(t, y, p, m, tol[0]) if self.modes else (y, m)
 
     def after(
         self, t: Array, p: Scene, tol: Array, fired: Array, dense: Array, y: State, m: Array
     ) -> tuple[State, Array]:
-        """State and modes after the guards that `fired`; `dense`: whether impacts accumulate."""
+        """State and modes after the guards that fired; dense: whether impacts accumulate."""
         y, m, touching = switch(t, y, p, m, fired > 0, tol[0], dense > 0, False)
         return self.on_constraints(t, p, y, touching) if p.contacts else y, m
 
@@ -139,49 +142,23 @@ def series_of(model: Model) -> dict[str, tuple[int, ...]]:
     return {name: x.shape for name, x in zip(names, shapes, strict=True)}
 
 
-def _routines(model: Model) -> dict[str, tuple[str, tuple[str, ...], str, Callable[..., PyTree]]]:
-    """Purpose, arguments, results (an array, or "y m" in place) and function of each C function, by name."""
-    state = ("t", "p", "y", "m")
-    routines = {
-        "rate": ("Rates of the state.", state, "out", model.rate),
-        "linear": ("Rates, their derivative by time, and their Jacobian by rows.", state, "out", model.linear),
-        "evaluate": ("Rates, guards and outputs.", (*state, "tol"), "out", model.evaluate),
-        "push": (
-            "Directional derivative of model_evaluate, along time, numbers and states.",
-            (*state, "tol", "along", "dp", "dy"),
-            "out",
-            model.push,
-        ),
-        "pull": (
-            "Adjoint derivative of model_evaluate, by time, numbers and states.",
-            (*state, "tol", "seed"),
-            "out",
-            model.pull,
-        ),
-        "start": ("State and modes at the start.", ("t", "p", "tol"), "y m", model.begin),
+def _routines(model: Model) -> dict[str, tuple[Callable[..., PyTree], tuple[str, ...]]]:
+    """Each C function by name: its function, and the arguments that it changes in place; others write to `out`."""
+    routines: dict[str, tuple[Callable[..., PyTree], tuple[str, ...]]] = {
+        "rate": (model.rate, ()),
+        "linear": (model.linear, ()),
+        "evaluate": (model.evaluate, ()),
+        "push": (model.push, ()),
+        "pull": (model.pull, ()),
+        "start": (model.begin, ("y", "m")),
     }
     if model.requirements:
-        routines["ranges"] = ("Whether each requirement holds.", ("p",), "out", model.ranges)
+        routines["ranges"] = (model.ranges, ())
     if model.modes:
-        routines["guards"] = (
-            "Guards, their tolerances, and their values at events.",
-            (*state, "tol"),
-            "out",
-            model.guards,
-        )
-        routines["switch"] = (
-            "State and modes after the guards that fired; dense: whether impacts accumulate.",
-            ("t", "p", "tol", "fired", "dense"),
-            "y m",
-            model.after,
-        )
+        routines["guards"] = (model.guards, ())
+        routines["switch"] = (model.after, ("y", "m"))
     if model.projects:
-        routines["project"] = (
-            "The state on the constraints, without slip in stick.",
-            ("t", "p", "m"),
-            "y",
-            model.projected,
-        )
+        routines["project"] = (model.projected, ("y",))
     return routines
 
 
@@ -197,16 +174,15 @@ def write_model(model: Model) -> tuple[str, str]:
     outputs = sum(int(np.prod(shape)) for shape in series_of(model).values())
     like["seed"] = jnp.zeros(_size(model.y) + model.modes + outputs)
     prototypes, functions = [], []
-    for name, (purpose, arguments, results, fn) in _routines(model).items():
-        changed = () if results == "out" else tuple(results.split())
-        order = (*arguments, *(x for x in ("y", "m") if x in changed and x not in arguments))
+    for name, (fn, changed) in _routines(model).items():
+        order = tuple(inspect.signature(fn).parameters)
         fixed = [f"{x}[{i}]" for x in changed for i in range(_size(like[x]))]
         lines = _lines(name, fn, {x: like[x] for x in order}, fixed)
-        declared = [_READ[x] for x in arguments]
+        declared = [_READ[x] for x in order if x not in changed]
         declared += [f"double *{x}" for x in (changed or ("out",))]
         signature = f"void model_{name}({', '.join(declared)})"
         idle = unused((*order, *(() if changed else ("out",))), lines)
-        prototypes.append(f"/* {purpose} */\n{signature};")
+        prototypes.append(f"/* {inspect.getdoc(fn) or name} */\n{signature};")
         functions.append("\n".join([signature + " {", *idle, *lines, "}\n"]))
     return "\n".join(prototypes), "\n".join(functions)
 

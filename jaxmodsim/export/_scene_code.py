@@ -1,13 +1,14 @@
 """A scene as C99, for a drive, a controller or a web page."""
 
+import inspect
 import re
+from collections import Counter
 from collections.abc import Callable
-from typing import NamedTuple
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from .._core.arguments import as_whole
 from ..scene import (
@@ -55,22 +56,22 @@ const {real} {name}_rest[{name}_Y] = {{{rest}}};
 """
 
 
-class _Routine(NamedTuple):
-    """A function of the generated code.
+# The functions of the generated code, with the numbers `p` and the state `y`; their docstrings become comments.
 
-    - `purpose`: the comment above it.
-    - `times`: names of its first arguments; the numbers p and the state y follow.
-    - `extra`: name and size of an array for its results, or None.
-    - `results`: the variables of its results.
-    - `fn`: `fn(*times, scene, y)` -> a pytree of these results.
-    """
 
-    name: str
-    purpose: str
-    times: tuple[str, ...]
-    extra: tuple[str, int] | None
-    results: list[str]
-    fn: Callable[..., PyTree]
+def _rate(t: Array, p: Scene, y: State) -> PyTree:
+    """Rates of the state y at the time t."""
+    return vector_field(t, y, p)
+
+
+def _step(t0: Array, t1: Array, p: Scene, y: State) -> PyTree:
+    """One step of ImplicitFriction from t0 to t1; false (0) where its equations were not solved."""
+    return scene_step(p, t0, t1, y)
+
+
+def _friction(t0: Array, t1: Array, p: Scene, y: State) -> PyTree:
+    """Force that makes up for friction at the motion in y; states of the laws in y go from t0 to t1."""
+    return compensating_force(p, t0, t1, y)
 
 
 def to_c(scene: Scene, dof: int = 1, *, name: str = "scene") -> str:
@@ -152,14 +153,14 @@ def to_c(scene: Scene, dof: int = 1, *, name: str = "scene") -> str:
     places = {f"{name}_p_{re.sub('[^0-9A-Za-z]+', '_', each).strip('_')}": each for each in elements(scene)}
     if len(places) < len(elements(scene)):
         raise ValueError(f"to_c: several numbers of the scene have the same name in C: {', '.join(elements(scene))}.")
-    routines, real = _routines(scene, y), type_of(start.dtype)
+    results, real = _results_of(scene, y), type_of(start.dtype)
     run = f"int {name}_run({real} t, {real} h, long steps, const {real} p[{name}_P], {real} y[{name}_Y])"
     numbers, rest = (
         ", ".join(literal(x) for leaf in jtu.tree_leaves(tree) for x in np.ravel(leaf)) for tree in (scene, y)
     )
     return _C_TEXT.format(
         name=name,
-        routines="\n".join(_routine_text(each, scene, y, name) for each in routines),
+        routines="\n".join(_routine_text(*each, scene, y, name) for each in results.items()),
         numbers=numbers,
         rest=rest,
         places="\n".join(f"  {place}, /* {each} */" for place, each in places.items()),
@@ -167,69 +168,42 @@ def to_c(scene: Scene, dof: int = 1, *, name: str = "scene") -> str:
         size=len(state_names(y)),
         dof=dof,
         real=real,
-        prototypes="\n".join([*(_c_signature(each, name, real) + ";" for each in routines), run + ";"]),
+        prototypes="\n".join([*(_c_signature(*each, name, real) + ";" for each in results.items()), run + ";"]),
         run=run,
     )
 
 
-def _routines(scene: Scene, y: State) -> list[_Routine]:
-    names, dof = state_names(y), y.q.shape[0]
-    own = [f"y[{i}]" for i in range(2 * dof, len(names))]
-    whole = [f"y[{i}]" for i in range(len(names))]
-    rates = [f"rate[{i}]" for i in range(len(names))]
-    force = [f"force[{i}]" for i in range(dof)]
-    routines = [
-        _Routine(
-            "rate",
-            "Rates of the state y at the time t.",
-            ("t",),
-            ("rate", len(names)),
-            rates,
-            lambda t, scene, y: vector_field(t, y, scene),
-        ),
-        _Routine(
-            "step",
-            "One step of ImplicitFriction from t0 to t1; false (0) where its equations were not solved.",
-            ("t0", "t1"),
-            None,
-            [*whole, "return"],
-            lambda t0, t1, scene, y: scene_step(scene, t0, t1, y),
-        ),
-    ]
+def _results_of(scene: Scene, y: State) -> dict[Callable[..., PyTree], list[str]]:
+    """The variables of the results of each function of the generated code."""
+    size, dof = len(state_names(y)), y.q.shape[0]
+    results: dict[Callable[..., PyTree], list[str]] = {
+        _rate: [f"rate[{i}]" for i in range(size)],
+        _step: [*(f"y[{i}]" for i in range(size)), "return"],
+    }
     if scene.friction:
-        purpose = "Force that makes up for friction at the motion in y; states of the laws in y go from t0 to t1."
-        routines.append(
-            _Routine(
-                "friction",
-                purpose,
-                ("t0", "t1"),
-                ("force", dof),
-                [*force, *own],
-                lambda t0, t1, scene, y: compensating_force(scene, t0, t1, y),
-            )
-        )
-    return routines
+        results[_friction] = [f"force[{i}]" for i in range(dof)] + [f"y[{i}]" for i in range(2 * dof, size)]
+    return results
 
 
-def _routine_text(routine: _Routine, scene: Scene, y: State, name: str) -> str:
-    arguments = {**dict.fromkeys(routine.times, jnp.zeros((), y.q.dtype)), "p": scene, "y": y}
+def _routine_text(fn: Callable[..., PyTree], results: list[str], scene: Scene, y: State, name: str) -> str:
+    known = {"p": scene, "y": y}
+    arguments = {x: known.get(x, jnp.zeros((), y.q.dtype)) for x in inspect.signature(fn).parameters}
     try:
-        lines = write_function(routine.fn, arguments, lambda _: routine.results)
+        lines = write_function(fn, arguments, lambda _: results)
     except ValueError as error:
         raise ValueError(
-            f"to_c does not support {error}, which `{routine.name}` of the scene needs. It supports arithmetic,"
+            f"to_c does not support {error}, which `{fn.__name__[1:]}` of the scene needs. It supports arithmetic,"
             " elementary functions and choices (jnp.where) of scalars and small arrays: express the Lagrangian, force"
             " or law by these."
         ) from error
-    head = [f"/* {routine.purpose} */", _c_signature(routine, name, type_of(y.q.dtype)) + " {"]
+    head = [f"/* {inspect.getdoc(fn) or fn.__name__} */", _c_signature(fn, results, name, type_of(y.q.dtype)) + " {"]
     return "\n".join([*head, *unused(arguments, lines), *lines, "}\n"])
 
 
-def _c_signature(routine: _Routine, name: str, real: str) -> str:
-    returns, constant = ("int", "") if "return" in routine.results else ("void", "const ")
-    changed = any(each.startswith("y[") for each in routine.results)
-    arguments = [f"{real} {each}" for each in routine.times]
-    arguments += [f"const {real} p[{name}_P]", f"{'' if changed else constant}{real} y[{name}_Y]"]
-    if routine.extra:
-        arguments.append(f"{real} {routine.extra[0]}[{routine.extra[1]}]")
-    return f"{returns} {name}_{routine.name}({', '.join(arguments)})"
+def _c_signature(fn: Callable[..., PyTree], results: list[str], name: str, real: str) -> str:
+    sizes = Counter(each.partition("[")[0] for each in results)
+    constant = "" if {"y", "return"} & set(sizes) else "const "
+    known = {"p": f"const {real} p[{name}_P]", "y": f"{constant}{real} y[{name}_Y]"}
+    arguments = [known.get(x, f"{real} {x}") for x in inspect.signature(fn).parameters]
+    arguments += [f"{real} {x}[{size}]" for x, size in sizes.items() if x not in ("y", "return")]
+    return f"{'int' if 'return' in sizes else 'void'} {name}{fn.__name__}({', '.join(arguments)})"
