@@ -130,14 +130,8 @@ def _belt_oscillator() -> NamedProblem:
 
 
 def _stribeck_belt() -> NamedProblem:
-    return _case(
-        "stribeck_belt",
-        belt_oscillator.scene(belt_oscillator.stribeck()),
-        [0.0],
-        [belt_oscillator.PARAMS["belt"]],
-        5.0,
-        "q[0]",
-    )
+    scene = belt_oscillator.scene(belt_oscillator.stribeck())
+    return _case("stribeck_belt", scene, [0.0], [belt_oscillator.PARAMS["belt"]], 5.0, "q[0]")
 
 
 def _coupled_belts() -> NamedProblem:
@@ -159,10 +153,9 @@ def _cart_pole() -> NamedProblem:
 
 
 def _turntable_puck() -> NamedProblem:
-    law = Coulomb(turntable_puck.PARAMS["mu"], 1.3 * turntable_puck.PARAMS["mu"])
-    return _case(
-        "turntable_puck", turntable_puck.scene(law), [turntable_puck.PARAMS["r0"], 0.0], [0.0, 0.0], 4.0, "q[1]"
-    )
+    mu, r0 = turntable_puck.PARAMS["mu"], turntable_puck.PARAMS["r0"]
+    scene = turntable_puck.scene(Coulomb(mu, 1.3 * mu))
+    return _case("turntable_puck", scene, [r0, 0.0], [0.0, 0.0], 4.0, "q[1]")
 
 
 def _spherical_pendulum() -> NamedProblem:
@@ -176,9 +169,8 @@ def _cartesian_spherical_pendulum() -> NamedProblem:
     phi, turn, t1 = 1.8, 2.0, 5.0
     q0, qd0 = [np.sin(phi), 0.0, np.cos(phi)], [0.0, turn * np.sin(phi), 0.0]
     exact = float(np.cos(spherical_pendulum.motion(t1, phi, turn)))
-    return _case(
-        "cartesian_spherical_pendulum", cartesian_pendulum.cartesian_spherical_pendulum(), q0, qd0, t1, "q[2]", exact
-    )
+    scene = cartesian_pendulum.cartesian_spherical_pendulum()
+    return _case("cartesian_spherical_pendulum", scene, q0, qd0, t1, "q[2]", exact)
 
 
 def _double_pendulum() -> NamedProblem:
@@ -204,21 +196,9 @@ def _four_bar() -> NamedProblem:
 
 
 _CASES: dict[str, Callable[[], NamedProblem]] = {
-    "lugre_box": _lugre_box,
-    "pulled_box": _pulled_box,
-    "slipping_bristle": _slipping_bristle,
-    "coulomb_box": _coulomb_box,
-    "braked_spring": _braked_spring,
-    "belt_oscillator": _belt_oscillator,
-    "stribeck_belt": _stribeck_belt,
-    "coupled_belts": _coupled_belts,
-    "stick_slip_pendulum": _stick_slip_pendulum,
-    "cart_pole": _cart_pole,
-    "turntable_puck": _turntable_puck,
-    "spherical_pendulum": _spherical_pendulum,
-    "cartesian_spherical_pendulum": _cartesian_spherical_pendulum,
-    "double_pendulum": _double_pendulum,
-    "charged_particle": _charged_particle,
-    "knife_edge": _knife_edge,
-    "four_bar": _four_bar,
-}
+    case.__name__.removeprefix("_"): case for case in (
+        _lugre_box, _pulled_box, _slipping_bristle, _coulomb_box, _braked_spring, _belt_oscillator, _stribeck_belt,
+        _coupled_belts, _stick_slip_pendulum, _cart_pole, _turntable_puck, _spherical_pendulum,
+        _cartesian_spherical_pendulum, _double_pendulum, _charged_particle, _knife_edge, _four_bar,
+    )
+}  # fmt: skip
