@@ -43,11 +43,9 @@ def panel_letters(panels: Iterable[Axes]) -> None:
         panel.set_title(letter, loc="left", fontweight="bold", fontsize=11)
 
 
-def legend_above(panel: Axes, ncols: int = 2) -> None:
+def legend_above(panel: Axes) -> None:
     """Place a legend above the right corner of a panel, outside the data."""
-    panel.legend(
-        loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, ncols=ncols, fontsize=9, frameon=False
-    )
+    panel.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, ncols=2, fontsize=9, frameon=False)
 
 
 def legend_beside(panel: Axes) -> None:

@@ -31,13 +31,12 @@ def sensitivity_figure(sensitivity: Sensitivity, *, most: int = 8) -> Figure:
     ranking = sensitivity.ranking[:most]
     colours = {name: COLOURS[i % len(COLOURS)] for i, (name, _) in enumerate(ranking)}
     styles = {name: ("-", "--", ":", "-.")[i // len(COLOURS) % 4] for i, name in enumerate(colours)}
-    unit = f" [{sensitivity.unit}]" if sensitivity.unit else ""
     height = 0.9 + 0.32 * len(ranking)
     if sensitivity.over_time:
         figure = Figure(figsize=(10, 5.2 + height), layout="constrained")
         above, middle, below = figure.subplots(3, 1, height_ratios=(1.6, 3.2, height))
         above.plot(sensitivity.t, sensitivity.observable, color=GREY, lw=1.6)
-        above.set(ylabel=f"{sensitivity.label}{unit}", title=f"Sensitivity of {sensitivity.label}")
+        above.set(ylabel=with_unit(sensitivity.label, sensitivity.unit), title=f"Sensitivity of {sensitivity.label}")
         above.tick_params(labelbottom=False)
         above.sharex(middle)
         for name, _ in ranking:

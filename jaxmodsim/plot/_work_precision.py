@@ -1,9 +1,11 @@
 """Work-precision diagrams."""
 
+from itertools import product
+
 import numpy as np
 from matplotlib.axes import Axes
 
-from ..analysis import Row, WorkPrecision
+from ..analysis import WorkPrecision
 from ._style import COLOURS, GREY, RED, Figure, panel_letters, plain_ticks
 
 _MARKERS = "osD^vPX*"
@@ -51,14 +53,16 @@ def work_precision_figure(study: WorkPrecision, *, cost: str = "run") -> Figure:
             handles += left.plot([], [], color=RED, marker="x", ls="", label=label)
             continue
         style = {"color": COLOURS[i % len(COLOURS)], "marker": _MARKERS[i % len(_MARKERS)], "ms": 6.0, "lw": 1.4}
-        errors = [_shown(row, study) for row in rows]
+        # Smaller errors than the disagreement of the references, or the rounding unit, are not resolved.
+        errors = [max(row.error or 0.0, study.disagreement, float(np.finfo(float).eps)) for row in rows]
         timings = [row.times[cost] for row in rows if row.times is not None]
         median = 1e3 * np.array([x.median for x in timings])
         bars = 1e3 * np.array([[x.median - x.low for x in timings], [x.high - x.median for x in timings]])
         bars = np.maximum(bars, 0.0)
         handles.append(left.errorbar(errors, median, yerr=bars, capsize=2.0, elinewidth=0.8, **style, label=label))
         right.plot(errors, [row.evaluations if counted else row.steps for row in rows], **style)
-        _mark_model(left, right, rows, COLOURS[i % len(COLOURS)])
+        for model, axes in product({row.model for row in rows if row.model}, (left, right)):
+            axes.axvline(model, color=style["color"], ls=":", lw=1.0)
     scale = f"{study.scale:.3g} {study.unit}".rstrip()
     for axes in (left, right):
         axes.set(xscale="log", yscale="log", xlabel=f"error of {study.observable}, relative to {scale} [1]")
@@ -81,17 +85,6 @@ def _failures(study: WorkPrecision) -> list[str]:
     """A line for each failure, shortened to the width of the figure."""
     lines = [f"failed: {row.method}, {row.setting}: {row.failed}" for row in study.rows if row.failed]
     return [line if len(line) <= 170 else f"{line[:167]}..." for line in lines]
-
-
-def _shown(row: Row, study: WorkPrecision) -> float:
-    """The error, or the disagreement of the references or the rounding unit if that is larger."""
-    return max(row.error or 0.0, study.disagreement, float(np.finfo(float).eps))
-
-
-def _mark_model(left: Axes, right: Axes, rows: list[Row], color: str) -> None:
-    for model in {row.model for row in rows if row.model}:
-        for axes in (left, right):
-            axes.axvline(model, color=color, ls=":", lw=1.0)
 
 
 def _mark_floor(axes: Axes, floor: float) -> None:
