@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.ndimage import median_filter
+from scipy.ndimage import convolve1d, median_filter
 
 from ._record import Record
 
@@ -27,8 +27,8 @@ _GAP, _FEW = 5.0, 0.01
 _MOVING = 0.05
 # Largest offset, as a share of the record, and in samples.
 _FURTHEST_SHARE, _FURTHEST = 0.1, 500
-# Iterations of the golden section between two samples, and its ratio.
-_REFINED, _GOLDEN = 40, 0.5 * (math.sqrt(5.0) - 1.0)
+# Tolerance of an offset, in intervals of the samples.
+_REFINED = 1e-8
 # Least number of moving samples for four regressors.
 _LEAST_MOVING = 100
 
@@ -44,10 +44,8 @@ class SmoothedMotion(NamedTuple):
 
 def smooth(x: Float[np.ndarray, " samples"], span: int) -> Float[np.ndarray, " samples"]:
     """Weighted mean over `span` samples to either side."""
-    from scipy.signal import convolve, windows  # most of a second to import, and only needed here
-
-    kernel = windows.hann(2 * span + 3)[1:-1]
-    return convolve(np.pad(x, span, mode="edge"), kernel / kernel.sum(), mode="valid", method="direct")
+    kernel = np.hanning(2 * span + 3)[1:-1]
+    return convolve1d(x, kernel / kernel.sum(), mode="nearest")
 
 
 def smooth_span(samples: int) -> int:
@@ -215,6 +213,8 @@ def clock_offset(record: Record, name: str = "u") -> tuple[float, float]:
     The offset [s], positive for an early input, and the root mean square of the residual with the shift, relative to
     that without it. `(0, 1)` for a motion that is too short.
     """
+    from scipy.optimize import minimize_scalar  # slow to import, and only needed here
+
     interval, furthest = float(np.median(np.diff(record.t))), int(min(_FURTHEST_SHARE * len(record.t), _FURTHEST))
     regression = _regression(record, name, furthest)
     if regression is None or furthest < 1:
@@ -231,8 +231,5 @@ def clock_offset(record: Record, name: str = "u") -> tuple[float, float]:
     best = least(-furthest, furthest, step)
     best = least(best - step, best + step, 1)
     low, high = (interval * min(max(best + side, -furthest), furthest) for side in (-1, 1))
-    for _ in range(_REFINED):
-        a, b = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-        low, high = (low, b) if squares(a) < squares(b) else (a, high)
-    offset = 0.5 * (low + high)
+    offset = float(minimize_scalar(squares, bounds=(low, high), options={"xatol": _REFINED * interval}).x)
     return offset, math.sqrt(squares(offset) / max(squares(0.0), _TINY))
