@@ -312,12 +312,7 @@ class Stochastic(AbstractInitializer):
 def _gradient(problem: FitProblem, x: Float[Array, " n"], drawn: Array) -> tuple[Array, Array]:
     """Mean loss of the drawn runs per sample, and its gradient by all of x."""
     shared, own = problem.split(x)
-    some = eqx.tree_at(
-        lambda p: (p.base, p.runs, p.known),
-        problem,
-        jtu.tree_map(lambda leaf: leaf[drawn], (problem.base, problem.runs, problem.known)),
-        is_leaf=lambda leaf: leaf is None,
-    )
+    some = problem.of_runs(drawn)
     residual, jacobian = some.evaluate(jnp.concatenate([shared, jnp.reshape(own[drawn], (-1,))]))
     cost = problem.loss.cost(residual)
     residual, jacobian = problem.loss.weighted(residual, jacobian)

@@ -2,6 +2,7 @@
 
 import abc
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -243,6 +244,11 @@ class FitProblem(eqx.Module):
             slip_weight={name: on_device(np.asarray(weight) * own) for name, weight in self.runs.slip_weight.items()},
         )
         return eqx.tree_at(lambda p: p.runs, self, runs)
+
+    def of_runs(self, rows: Int[Array, " some"] | slice) -> "FitProblem":
+        """The problem of some of the runs."""
+        base, runs, known = jtu.tree_map(lambda leaf: leaf[rows], (self.base, self.runs, self.known))
+        return replace(self, base=base, runs=runs, known=known)
 
     @property
     def reported(self) -> int:

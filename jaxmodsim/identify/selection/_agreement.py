@@ -1,11 +1,9 @@
 """Variation between records: parameters of each record fitted by itself, tested, and carried to the output."""
 
-import dataclasses
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -247,9 +245,7 @@ def _fit_one(
     The better of two searches: from the end of the fit to all, and from there with the friction level of this record. A
     fit to records with different levels has other parameters wrong, too, in a valley of its own.
     """
-    names = together.free.names
-    base, runs, known = jax.tree.map(lambda leaf: leaf[i : i + 1], (together.base, together.runs, together.known))
-    problem = dataclasses.replace(together, base=base, runs=runs, known=known)
+    names, problem = together.free.names, together.of_runs(slice(i, i + 1))
     information = result.estimate.information
     if len(free) < len(names):
         problem = problem.pinned(x, information, free)

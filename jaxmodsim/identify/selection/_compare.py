@@ -20,7 +20,7 @@ from ..data._record import Record, Runs, cut, runs_of
 from ..estimate._initializers import AbstractInitializer, Continuation, FromSmaller, as_initializers, last_part
 from ..estimate._prepare import FitOptions, StartState, initial_states, measured_start, prepare, prepare_law
 from ..estimate._problem import AbstractLoss, FitProblem
-from ..estimate._search import Progress, SearchOptions, SearchResult, SearchState, finished, solve
+from ..estimate._search import SearchOptions, SearchResult, SearchState, finished, solve
 from ..model._engines import DELAY
 from ..model._observe import Observable, by_channel, first_coordinate
 from ..model._parameters import split_entries
@@ -197,17 +197,6 @@ def _names(scene: Scene, records: tuple[Record, ...]) -> set[str]:
     return {*split_entries(scene_numbers(scene)), *(DELAY + name for record in records for name in record.inputs)}
 
 
-def _progress_of(progress: CompareProgress | None, name: str, fold: int | None) -> Progress | None:
-    if progress is None:
-        return None
-
-    def report(iteration: int, rms: float, values: dict[str, float]) -> None:
-        del values
-        progress(name, fold, iteration, rms)
-
-    return report
-
-
 def _from_smaller(free: Sequence[str], judged: Mapping[str, CrossValidated]) -> tuple[AbstractInitializer, ...]:
     """From the fit of the largest model all of whose parameters are among `free`, by the last parts of their names."""
     names = {last_part(name) for name in free}
@@ -233,7 +222,8 @@ def _validated(
     model, free, folds, initializers = candidate.scene, candidate.free, options.folds, options.initializers
 
     def search_options(fold: int | None, rtol: float = ENOUGH) -> SearchOptions:
-        return SearchOptions(rtol, options.max_steps, _progress_of(report, name, fold))
+        progress = None if report is None else lambda number, rms, _: report(name, fold, number, rms)
+        return SearchOptions(rtol, options.max_steps, progress)
 
     if isinstance(model, AbstractLaw):
         prepared, free = prepare_law(model, options.records, free, options.fit.loss), tuple(ranges_of(model))
