@@ -43,11 +43,7 @@ def peak(of: str) -> Metric:
     0.3162 m/s
     ```
     """
-    return Metric(f"peak |{of}|", named_unit(of), _peak, (of,))
-
-
-def _peak(run: Trajectory, of: str) -> Array:
-    return peak_of(run, of)
+    return Metric(f"peak |{of}|", named_unit(of), peak_of, (of,))
 
 
 def final(of: str) -> Metric:

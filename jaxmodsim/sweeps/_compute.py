@@ -119,7 +119,8 @@ def _in_groups(
         full = np.concatenate([rows, np.repeat(rows[-1:], size - rows.size)])
         own = {name: x[full].reshape(*shape, *x.shape[1:]) for name, x in numbers.items()}
         part = _call_and_wait(run, fixed, own if device is None else jax.device_put(own, device))
-        code, steps, values = (jtu.tree_map(_flat, x) for x in (part.code, part.num_steps, part.values))
+        flat = partial(jtu.tree_map, lambda x: np.asarray(x).reshape(-1, *x.shape[2:]))
+        code, steps, values = flat((part.code, part.num_steps, part.values))
         if computed is None:
             empty = partial(jtu.tree_map, lambda x: np.zeros((runs, *x.shape[1:]), x.dtype))
             computed = Computed(np.zeros(runs, np.int32), np.zeros(runs, np.int32), empty(values))
@@ -141,10 +142,6 @@ def _call_and_wait(run: AbstractRun, fixed: PyTree, numbers: PyTree) -> RunOutco
             f"One of the runs raised an error, which ends the sweep: {match[1]} Pass throw=False to simulate in the"
             " swept function, and return the run or numbers of it: a failure then affects this run alone."
         ) from error
-
-
-def _flat(x: Array) -> np.ndarray:
-    return np.asarray(x).reshape(-1, *x.shape[2:])
 
 
 @partial(jax.jit, static_argnames=("run",))
