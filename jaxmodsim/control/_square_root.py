@@ -150,13 +150,8 @@ def predict(fn: Callable[[Array], Array], x: Gaussian, noise: Float[Array, " n"]
 
 def _divide(left: Float[Array, "m n"], factor: Float[Array, "n n"]) -> Float[Array, "m n"]:
     """`B L^-1` for a lower triangular L; zeros for columns without a pivot."""
-    n = factor.shape[0]
-    columns: dict[int, Array] = {}
-    for j in reversed(range(n)):
-        known = sum((columns[i] * factor[i, j] for i in range(j + 1, n)), jnp.zeros_like(left[:, j]))
-        pivot = factor[j, j]
-        columns[j] = jnp.where(pivot > 0, (left[:, j] - known) / jnp.where(pivot > 0, pivot, 1.0), 0.0)
-    return jnp.stack([columns[j] for j in range(n)], axis=1)
+    # L' X' = B', where L' is lower triangular in the reverse order.
+    return solve_lower(factor.T[::-1, ::-1], left.T[::-1])[::-1].T
 
 
 class Correction(NamedTuple):
