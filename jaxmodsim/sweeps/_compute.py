@@ -5,6 +5,7 @@ import hashlib
 import re
 import threading
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import islice
@@ -218,18 +219,18 @@ def run_on_executor(work: Work, tasks: Iterable[Task], executor: Any) -> Iterato
     packed = extra("cloudpickle").dumps(work)
     key = hashlib.sha256(packed).hexdigest()
     if isinstance(executor, cf.Executor):
-        workers = getattr(executor, "_max_workers", None) or _UNKNOWN_WORKERS
-        yield from _as_completed(lambda task: executor.submit(run_packed, key, packed, task), tasks, _AHEAD * workers)
-        return
-    if not callable(getattr(executor, "get_executor", None)):
+        opened, workers = nullcontext(executor), getattr(executor, "_max_workers", None)
+    elif callable(getattr(executor, "get_executor", None)):
+        opened, workers = executor.get_executor(pure=False), sum(executor.nthreads().values())
+    else:
         raise ValueError(
             "executor must be a dask.distributed.Client or a concurrent.futures.Executor, but a"
             f" {type(executor).__name__} was given."
         )
-    # Sent with every block, as scattered data is lost with the last worker that holds it.
-    with executor.get_executor(pure=False) as pool:
-        workers = sum(executor.nthreads().values()) or _UNKNOWN_WORKERS
-        yield from _as_completed(lambda task: pool.submit(run_packed, key, packed, task), tasks, _AHEAD * workers)
+    most = _AHEAD * (workers or _UNKNOWN_WORKERS)
+    with opened as pool:
+        # The work is sent with every block, as scattered data is lost with the last worker that holds it.
+        yield from _as_completed(lambda task: pool.submit(run_packed, key, packed, task), tasks, most)
 
 
 def run_packed(key: str, packed: bytes, task: Task) -> tuple[int, Computed]:
