@@ -39,7 +39,9 @@ def work_precision_figure(study: WorkPrecision, *, cost: str = "run") -> Figure:
     """
     if cost not in study.costs:
         raise ValueError(f"cost must be one that the study has measured ({', '.join(study.costs)}), but is {cost!r}.")
-    failures = _failures(study)
+    lines = [f"failed: {row.method}, {row.setting}: {row.failed}" for row in study.rows if row.failed]
+    # Shortened to the width of the figure.
+    failures = [line if len(line) <= 170 else f"{line[:167]}..." for line in lines]
     height = 4.4 + 0.2 * len(failures)
     figure = Figure(figsize=(11.5, height), layout="constrained")
     left, right = figure.subplots(1, 2, sharex=True)
@@ -79,12 +81,6 @@ def work_precision_figure(study: WorkPrecision, *, cost: str = "run") -> Figure:
     if failures:
         figure.supxlabel("\n".join(failures), fontsize=7, color=RED, x=0.01, ha="left")
     return figure
-
-
-def _failures(study: WorkPrecision) -> list[str]:
-    """A line for each failure, shortened to the width of the figure."""
-    lines = [f"failed: {row.method}, {row.setting}: {row.failed}" for row in study.rows if row.failed]
-    return [line if len(line) <= 170 else f"{line[:167]}..." for line in lines]
 
 
 def _mark_floor(axes: Axes, floor: float) -> None:
