@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -231,5 +231,6 @@ def clock_offset(record: Record, name: str = "u") -> tuple[float, float]:
     best = least(-furthest, furthest, step)
     best = least(best - step, best + step, 1)
     low, high = (interval * min(max(best + side, -furthest), furthest) for side in (-1, 1))
-    offset = float(minimize_scalar(squares, bounds=(low, high), options={"xatol": _REFINED * interval}).x)
+    optimum: Any = minimize_scalar(squares, bounds=(low, high), options={"xatol": _REFINED * interval})
+    offset = float(optimum.x)
     return offset, math.sqrt(squares(offset) / max(squares(0.0), _TINY))
