@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import jax
-import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import Array
 
+from .._core.arrays import is_known
 from .._core.readable import Table
 from ..scene import Scene, elements, read_element, replace_elements
 from ..simulation import Trajectory, simulate
@@ -208,7 +208,6 @@ def check_gradients(
     scale = {name: (scales or {}).get(name, abs(x) or 1.0) for name, x in entries.items()}
     slopes = [abs(d[name]) * scale[name] for d in (forward, reverse) for name in entries]
     limits = Agreement(
-        itemsize,
         float(np.finfo(f"f{itemsize}").eps),
         _RTOL[itemsize] if rtol is None else rtol,
         _RTOL_MODES[itemsize],
@@ -284,17 +283,13 @@ def _first(fn: Callable[..., Any], scene: Scene, runs: list[Trajectory]) -> tupl
         raise ValueError(f"{_INTERFACE} This function did not call it.")
     if not np.isfinite(value):
         raise ValueError(f"fn must return a finite number, but it returned {value} at this scene.")
-    recorded = [run for run in runs if not _traced(run)]
+    recorded = [run for run in runs if is_known(*jtu.tree_leaves(run))]
     atol = max((float(run.request.atol) for run in recorded), default=0.0)
     complete = len(recorded) == len(runs)
     adjoints = [run.request.adjoint.rest for run in runs if run.request.adjoint is not None]
     others = {type(each).__name__ for each in adjoints if not isinstance(each, StoredSteps)}
     runs.clear()
     return jnp.asarray(value), complete, atol, tuple(sorted(others))
-
-
-def _traced(tree: PyTree) -> bool:
-    return any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves(tree))
 
 
 def _forward(fn: Callable[..., object], scene: Scene, name: str) -> float:
@@ -326,7 +321,7 @@ def _evaluate(
     except (RuntimeError, ValueError) as error:
         return Sample(x, float("nan"), {}, str(error).strip().splitlines()[0].split(" The run stopped at")[0])
     histories: Histories = {}
-    for i, run in enumerate(r for r in runs if not _traced(r)):
+    for i, run in enumerate(r for r in runs if is_known(*jtu.tree_leaves(r))):
         histories.update({(i, effect): history for effect, history in _histories(run).items()})
     return Sample(x, value, histories, "" if np.isfinite(value) else f"fn returns {value}.")
 

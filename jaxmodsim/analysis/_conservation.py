@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 
 import jax
-import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._core.arrays import is_known
 from ..scene import Scene
 from ..simulation import Trajectory
 
@@ -146,7 +146,7 @@ def cyclic_coordinates(scene: Scene, dof: int) -> tuple[int, ...]:
     (1,)
     ```
     """
-    if any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves(scene)):
+    if not is_known(*jtu.tree_leaves(scene)):
         raise ValueError(
             "cyclic_coordinates needs concrete numbers, so it cannot run inside jax.jit, jax.vmap or jax.grad."
         )

@@ -55,13 +55,12 @@ class DerivativeEstimate(NamedTuple):
 class Agreement(NamedTuple):
     """Tolerances of the comparison.
 
-    - `itemsize`, `eps`: bytes and rounding unit of the floating type.
+    - `eps`: rounding unit of the floating type.
     - `rtol`, `rtol_modes`: relative, between derivatives and differences, and between forward and reverse mode.
     - `size`: the largest of the function, its changes per relative change of a number, and the absolute tolerance of
       the runs. Much smaller derivatives count as zero.
     """
 
-    itemsize: int
     eps: float
     rtol: float
     rtol_modes: float

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._core.arguments import check_real
+from .._core.arrays import is_known
 from .._core.readable import AbstractReadable, Table, short, table_of
 from ..scene import Scene, State, check_scene, from_dynamics, quantity_of
 from ._orbit import NEUTRAL, format_complex
@@ -142,7 +142,7 @@ def equilibrium(scene: Scene, q0: ArrayLike | list[float], *, ends: Mapping[str,
     point, _ = solve_rest(problem, x, 0.0, dof, rest_scale(x, dof, 1.0))
     refuse_time(problem, point, dof)
     rest = describe_rest(problem, point, dof)
-    if not any(isinstance(leaf, jax.core.Tracer) for leaf in jtu.tree_leaves(scene)):
+    if is_known(*jtu.tree_leaves(scene)):
         return rest
     # One step of Newton from the solution has the derivatives of the implicit function theorem.
     at = rest_equations(problem, scene, jnp.asarray(point.x), jnp.zeros(()), dof)
@@ -255,7 +255,7 @@ def describe_rest(problem: RestProblem, point: RestPoint, dof: int) -> Equilibri
 @table_of.register
 def _(rest: Equilibrium) -> Table:
     """Coordinates, eigenvalues, stability."""
-    if isinstance(rest.q, jax.core.Tracer):
+    if not is_known(rest.q):
         return Table("Equilibrium, traced", (), [])
     rows = [(quantity_of(rest.scene, f"q[{i}]").label, short(x)) for i, x in enumerate(rest.q)]
     notes = [f"eigenvalues {', '.join(map(format_complex, rest.eigenvalues))} 1/s"] if len(rest.eigenvalues) else []

@@ -3,11 +3,11 @@
 from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from .._core.arrays import is_known
 from .._core.readable import AbstractReadable, Table, short, table_of
 from ..scene import State, quantity_of
 from ..simulation import Trajectory
@@ -140,7 +140,7 @@ def format_complex(x: complex) -> str:
 @table_of.register
 def _(orbit: PeriodicOrbit) -> Table:
     """Extent, period, stability, modes."""
-    if isinstance(orbit.period, jax.core.Tracer):
+    if not is_known(orbit.period):
         return Table("PeriodicOrbit, traced", (), [])
     scene = orbit.runs[0].scene
     columns = {"lowest": orbit.lowest, "highest": orbit.highest, "velocity at the start": orbit.qd}

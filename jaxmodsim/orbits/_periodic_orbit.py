@@ -7,13 +7,13 @@ from typing import TypeAlias
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
 from .._core.arguments import as_float, as_whole, check_real
+from .._core.arrays import is_known
 from ..scene import Scene, State
 from ._neutral import anchored, differs, moving_on, shifted
 from ._newton import newton
@@ -114,7 +114,7 @@ def periodic_orbit(
     problem, start, dof = prepare(known, guess, period, section, settle, rtol, atol, segments=segments)
     point = shoot(problem, start, dof)
     orbit, lowest, highest = describe(problem, point, dof)
-    if not any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves(scene)):
+    if is_known(*jtu.tree_leaves(scene)):
         return orbit
     return _with_derivatives(eqx.tree_at(lambda p: p.scene, problem, scene), point, orbit, (lowest, highest))
 
@@ -235,7 +235,7 @@ def check_known(scene: Scene, name: str) -> None:
     """
     if not isinstance(scene, Scene):
         raise ValueError(f"{name} needs a Scene, but a {type(scene).__name__} was given.")
-    if any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves(scene)):
+    if not is_known(*jtu.tree_leaves(scene)):
         raise ValueError(
             f"{name} needs concrete numbers, but those of the scene are traced by jax.jit or jax.vmap: call it outside"
             " of these. jax.grad and jax.jacfwd work."
