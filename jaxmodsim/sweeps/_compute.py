@@ -9,7 +9,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import islice
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -161,27 +161,20 @@ def program(run: AbstractRun, fixed: PyTree, numbers: PyTree) -> str:
     return _program(rehearsed(run), *_abstract(fixed, numbers))
 
 
-_Avals: TypeAlias = tuple[tuple[tuple[int, ...], object], ...]
-
-
-def _abstract(*trees: PyTree) -> tuple[object, _Avals]:
+def _abstract(*trees: PyTree) -> tuple[Any, tuple[jax.ShapeDtypeStruct, ...]]:
     """Structure, shapes and types, which determine a trace."""
     leaves, structure = jtu.tree_flatten(trees)
-    return structure, tuple((jnp.shape(x), jnp.result_type(x)) for x in leaves)
-
-
-def _concrete(structure: object, avals: _Avals) -> PyTree:
-    return jtu.tree_unflatten(structure, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in avals])
+    return structure, tuple(jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)) for x in leaves)
 
 
 @lru_cache(maxsize=32)
-def _shapes(run: AbstractRun, structure: object, avals: _Avals) -> RunOutcome:
-    return jax.eval_shape(run.evaluate, *_concrete(structure, avals))
+def _shapes(run: AbstractRun, structure: Any, leaves: tuple[jax.ShapeDtypeStruct, ...]) -> RunOutcome:
+    return jax.eval_shape(run.evaluate, *jtu.tree_unflatten(structure, leaves))
 
 
 @lru_cache(maxsize=32)
-def _program(run: AbstractRun, structure: object, avals: _Avals) -> str:
-    text = jax.jit(run.evaluate).lower(*_concrete(structure, avals)).as_text()
+def _program(run: AbstractRun, structure: Any, leaves: tuple[jax.ShapeDtypeStruct, ...]) -> str:
+    text = jax.jit(run.evaluate).lower(*jtu.tree_unflatten(structure, leaves)).as_text()
     return hashlib.sha256(text.encode()).hexdigest()
 
 
