@@ -51,21 +51,19 @@ def _testbench_files() -> dict[str, Content]:
         show("LuGre over sigma0 and sigma1")
         sweep = grid_of_runs.result()
     results = [run_ramp(case) for case in cases]  # already compiled, and timed alone
-    rows = [
-        (
-            x.case.part,
-            x.case.label,
-            x.break_away,
-            x.crossings,
-            float(x.run.velocity[-1]) if x.ok else np.nan,
-            x.steps,
-            round(x.milliseconds, 2),
-            x.ending,
-        )
+    table = pd.DataFrame(
+        {
+            "part": x.case.part,
+            "model": x.case.label,
+            "away [s]": x.break_away,
+            "crossings": x.crossings,
+            "v(10 s) [m/s]": float(x.run.velocity[-1]) if x.ok else np.nan,
+            "steps": x.steps,
+            "run [ms]": round(x.milliseconds, 2),
+            "ending": x.ending,
+        }
         for x in results
-    ]
-    columns = ("part", "model", "away [s]", "crossings", "v(10 s) [m/s]", "steps", "run [ms]", "ending")
-    table = frame_of(rows, *columns)
+    )
     show_table(table, "A box of 2 kg under a force rising with time")
     sigma0, sigma1 = np.meshgrid(sweep["sigma0"], sweep["sigma1"], indexing="ij")
     grid = {

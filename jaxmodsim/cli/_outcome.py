@@ -217,21 +217,20 @@ def record_table(outcome: FitOutcome) -> pd.DataFrame:
     for score in outcome.scores:
         start = score.start_fitted.rmse["measured"] if score.start_fitted else math.nan
         errors.append((score.record, "held out", score.rmse["measured"], start))
-    rows = [
-        (
-            record.name,
-            use,
-            len(record.t),
-            float(record.t[0]),
-            float(record.t[-1]),
-            1e3 * rmse,
-            100 * rmse / float(np.std(record.measured) or np.nan),
-            1e3 * start,
-        )
+    unit = f"RMSE [m{outcome.measured['unit']}]"
+    return pd.DataFrame(
+        {
+            "record": record.name,
+            "use": use,
+            "samples": len(record.t),
+            "from [s]": float(record.t[0]),
+            "to [s]": float(record.t[-1]),
+            unit: 1e3 * rmse,
+            "of its standard deviation [%]": 100 * rmse / float(np.std(record.measured) or np.nan),
+            f"start fitted, {unit}": 1e3 * start,
+        }
         for record, use, rmse, start in errors
-    ]
-    unit, whole = f"RMSE [m{outcome.measured['unit']}]", "of its standard deviation [%]"
-    return frame_of(rows, "record", "use", "samples", "from [s]", "to [s]", unit, whole, f"start fitted, {unit}")
+    )
 
 
 def sample_table(outcome: FitOutcome) -> pd.DataFrame:
