@@ -23,16 +23,16 @@ FILES = sorted(ROOT.rglob("*.py"))
 # private to the package. The number is the budget of lines of a room: to raise it is a decision, whose commit says why.
 CORE = {"_core": 3329, "mechanics": 1577, "friction": 3009, "scene": 3803, "solvers": 4064, "simulation": 3185}
 APPLICATIONS = {
-    "metrics": 650,
-    "analysis": 2142,
-    "orbits": 3137,
-    "identify": 9681,
-    "sweeps": 2102,
-    "export": 2100,
-    "control": 800,
-    "problems": 2900,
-    "plot": 1729,
-    "cli": 3399,
+    "metrics": 634,
+    "analysis": 2136,
+    "orbits": 3121,
+    "identify": 9667,
+    "sweeps": 2093,
+    "export": 1905,
+    "control": 790,
+    "problems": 2835,
+    "plot": 1715,
+    "cli": 3396,
 }
 LABORATORY = ("tests", "bench")
 ROOMS = (*CORE, *APPLICATIONS)
