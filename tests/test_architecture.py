@@ -25,10 +25,10 @@ CORE = {"_core": 3329, "mechanics": 1577, "friction": 3009, "scene": 3803, "solv
 APPLICATIONS = {
     "metrics": 634,
     "analysis": 2136,
-    "orbits": 3121,
+    "orbits": 3122,
     "identify": 9667,
     "sweeps": 2093,
-    "export": 1905,
+    "export": 1906,
     "control": 790,
     "problems": 2835,
     "plot": 1715,
