@@ -397,9 +397,9 @@ def test_only_a_dead_zone_brings_the_holding_force() -> None:
     assert pivots_and_quotients(DeadZone(Coulomb(1.0), 1e-3)) == (2, 7)
 
 
-@pytest.mark.parametrize("name", ["inital_state", "Power", "store_energy", "chek"])
+@pytest.mark.parametrize("name", ["inital_state", "Power", "store_energy"])
 def test_a_misspelled_method_of_an_effect_is_refused(name: str) -> None:
-    meant = {"inital_state": "initial_state", "Power": "power", "store_energy": "stored_energy", "chek": "check"}[name]
+    meant = {"inital_state": "initial_state", "Power": "power", "store_energy": "stored_energy"}[name]
     with pytest.raises(TypeError, match=rf"Own\.{name} is no method of AbstractEffect\. Did you mean '{meant}'\?"):
         type("Own", (AbstractEffect,), {name: lambda self: None})
 
