@@ -81,12 +81,13 @@ def safe_norm(x: Float[Array, "..."], *, axis: int = -1) -> Float[Array, "..."]:
 
 
 def rounding_of(
-    fn: Callable[..., Float[Array, " n"]], *at: Float[Array, "..."], least: tuple[Float[Array, ""] | float, ...]
-) -> Float[Array, " n"]:
-    """Error of each value of `fn(*at)` by the rounding of the arguments plus their `least` error; constant."""
+    fn: Callable[..., Float[Array, ""]], *at: Float[Array, "..."], least: tuple[Float[Array, ""], ...] = ()
+) -> Float[Array, ""]:
+    """Error of `fn(*at)` by the rounding of its arguments, and by errors of the last ones, `least`; constant."""
     at = jax.lax.stop_gradient(at)
-    total = 0.0
-    for slope, x, error in zip(jax.jacrev(fn, tuple(range(len(at))))(*at), at, least, strict=True):
-        error = _ROUNDING * float(jnp.finfo(x.dtype).eps) * jnp.abs(x) + error
-        total += jnp.sum(jnp.abs(slope) * jnp.broadcast_to(error, slope.shape), axis=tuple(range(1, slope.ndim)))
-    return jax.lax.stop_gradient(jnp.asarray(total))
+    slopes = jax.grad(fn, tuple(range(len(at))))(*at)
+    eps = float(jnp.finfo(at[0].dtype).eps)
+    error = _ROUNDING * eps * sum(jnp.sum(jnp.abs(slope * x)) for slope, x in zip(slopes, at, strict=True))
+    for slope, each in zip(slopes[len(at) - len(least) :], least, strict=True):
+        error += each * jnp.sum(jnp.abs(slope))
+    return jax.lax.stop_gradient(jnp.asarray(error))

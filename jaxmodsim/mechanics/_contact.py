@@ -215,7 +215,7 @@ class Contact(AbstractPositionConstraint):
     def rounding(self, t: Scalar, q: PerDof, params: PyTree) -> Scalar:
         """Rounding error of the gap due to coordinates and time, without derivatives."""
         params = jax.lax.stop_gradient(params)
-        return rounding_of(lambda t, q: self.error(t, q, params), t, q, least=(0.0, 0.0))[0]
+        return rounding_of(lambda t, q: self.error(t, q, params)[0], t, q)
 
     def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
         """Check that the gap is one number."""

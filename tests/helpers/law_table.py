@@ -13,7 +13,7 @@ def law_table() -> str:
     """Markdown: one row for each registered law."""
     rows = ["| friction law | what it is | force | how it runs |", "|---|---|---|---|"]
     for name, law in laws().items():
-        arguments = ", ".join(field.name for field in dataclasses.fields(law))
+        arguments = ", ".join(field.name for field in dataclasses.fields(law) if field.init)
         equations = ", ".join(f"`{line}`" for line in law.equations).replace("|", r"\|")
         rows.append(f"| `{name}({arguments})` | {law.description} | {equations} | {law.execution} |")
     return "".join(f"{row}\n" for row in rows)
