@@ -213,7 +213,7 @@ class Dynamics(NamedTuple):
             kinks, none = self.scene.num_kinks, jnp.zeros_like(sides)
             # Kinks have the rounding of their numbers as a hysteresis, as they may stay near zero.
             rounding = none.at[sides.size - kinks :].set(self.unbound.kink_rounding(*state, rest)) if kinks else none
-            guards.append(sides * self.unbound.side_values(*state) + rounding)
+            guards.append(sides * self.scene.side_values(*state) + rounding)
             atol.append(rounding)
             roots.append(rounding)
         return tuple(jnp.concatenate(each) for each in (guards, atol, roots))

@@ -311,7 +311,7 @@ class Scene(AbstractReadable, eqx.Module):
     def kink_rounding(self, t: Scalar, q: PerDof, qd: PerDof, rest: Scalar) -> Float[Array, " kinks"]:
         """Rounding errors of the kinks, constant; at least those of the changes `rest` of q and qd."""
         held = jax.lax.stop_gradient(self)
-        kinks = [partial(lambda i, *at: held._kinks(*at)[i], i) for i in range(self.num_kinks)]
+        kinks = [lambda *at, i=i: held._kinks(*at)[i] for i in range(self.num_kinks)]
         return jnp.stack([rounding_of(kink, t, q, qd, least=(rest, rest)) for kink in kinks])
 
     def _kinks(self, t: Scalar, q: PerDof, qd: PerDof) -> list[Scalar]:

@@ -349,9 +349,10 @@ def test_derivatives_over_zeros_of_the_torque_equal_differences_in_single_precis
     def end(x: Any, **options: Any) -> Any:
         k, w, drive = x
         scene = joint(Geared(Coulomb(jnp.full_like(k, 0.05)), drive, spring, BACK), 2.0, w=w, c=0.3, load=0.0)
-        scene = eqx.tree_at(lambda x: (x.params["k"], x.params["J1"], x.params["J2"]), scene, (k, 0.0 * k + 0.5, k / k))
-        scene = jax.tree.map(lambda leaf: jnp.asarray(leaf, k.dtype), scene)
-        run = jms.simulate(scene, 0.0 * k[None] * jnp.ones(2, k.dtype), jnp.zeros(2, k.dtype), 6.0, **options)
+        inertias = jnp.array(0.5), jnp.array(1.0)
+        scene = eqx.tree_at(lambda x: (x.params["k"], x.params["J1"], x.params["J2"]), scene, (k, *inertias))
+        scene, rest = jax.tree.map(lambda leaf: jnp.asarray(leaf, k.dtype), scene), jnp.zeros(2, k.dtype)
+        run = jms.simulate(scene, rest, rest, 6.0, **options)
         return jnp.concatenate([run.q[-1], run.qd[-1]]), run.stats["num_events"]
 
     x = np.array([30.0, 2.0, 0.2])
