@@ -1,6 +1,7 @@
 """The compiled part of a run."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -171,7 +172,10 @@ def _plugins(request: RunRequest, system: IntegratedSystem) -> tuple[Any, Any]:
         solver = request.solver.whole
     if isinstance(solver, Rodas5P) and solver.linear_solver is None and not system.audited and _structured(request):
         solver = Rodas5P(solver.pivot, system.linear_solver)
-    return solver, StoredSteps() if request.adjoint is None else request.adjoint.whole
+    adjoint = StoredSteps() if request.adjoint is None else request.adjoint.whole
+    if request.scene.compliant and isinstance(adjoint, StoredSteps):
+        adjoint = replace(adjoint, brief=True)
+    return solver, adjoint
 
 
 def _well_posed(request: RunRequest) -> Bool[Array, ""]:

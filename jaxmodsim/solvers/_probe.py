@@ -36,10 +36,16 @@ _SHORT, _OVER_A_KINK = 8.0, 32.0
 
 
 class ProbeTangent(NamedTuple):
-    """The tangents of the state and of the solver's state, and the largest values of the former so far."""
+    """The tangents of the state and of the solver's state, and the magnitudes of the former so far.
+
+    Errors are relative to the magnitudes: the largest values, or, with `elapsed`, means over this time since the start.
+    Through a stiff contact a tangent moves as the force does, thousands of times larger than behind it, and parts
+    cancel. An error that is small beside the peak would be most of what remains.
+    """
 
     tangent: tuple[PyTree, PyTree]
-    largest: PyTree
+    magnitude: PyTree
+    elapsed: Array | None
     # 0 in a first step with a projection, else 1. That projection changes the tangent by a jump, which is no error and
     # does not shrink with the step.
     counts: Array
@@ -78,9 +84,14 @@ def direction(step: PyTree, y0: PyTree, asked: tuple[PyTree, PyTree], controller
 
 
 def start(
-    t0: Array, y0: PyTree, solver_state: PyTree, change: PyTree, project: Callable[[Array, PyTree], PyTree] | None
+    t0: Array,
+    y0: PyTree,
+    solver_state: PyTree,
+    change: PyTree,
+    project: Callable[[Array, PyTree], PyTree] | None,
+    brief: bool,
 ) -> Probed:
-    """The initial state of a run, and its change after the projection."""
+    """The initial state of a run, and its change after the projection; `brief` asks for means as magnitudes."""
     tangent = filled(change, y0)
     if project is not None:
         numbers, rest = eqx.partition(y0, eqx.is_inexact_array)
@@ -88,7 +99,8 @@ def start(
         tangent = jax.jvp(moved, (numbers,), (tangent,))[1]
     tangent = _moving(tangent), filled(None, solver_state)
     counts = jnp.asarray(1.0 if project is None else 0.0, t0.dtype)
-    return Probed(y0, ProbeTangent(tangent, jtu.tree_map(jnp.abs, _integrated(tangent[0])), counts))
+    magnitude, elapsed = jtu.tree_map(jnp.abs, _integrated(tangent[0])), jnp.zeros_like(counts) if brief else None
+    return Probed(y0, ProbeTangent(tangent, magnitude, elapsed, counts))
 
 
 class ProbedStep(NamedTuple):
@@ -114,13 +126,19 @@ class ProbedStep(NamedTuple):
         (_, _), (tangent, error_of_probe), (y1, error, dense, state1, result) = jax.jvp(
             advance, (numbers, moving), (self.change, probe.tangent), has_aux=True
         )
-        largest = jtu.tree_map(lambda d, x: jnp.maximum(jnp.abs(d), x), _integrated(tangent[0]), probe.largest)
-        ends = jtu.tree_map(lambda a, b: jnp.maximum(jnp.abs(a), jnp.abs(b)), _integrated(held), _integrated(y1))
-        errors = jnp.where(probe.counts > 0, self._size((t0, t1), error, error_of_probe, largest, ends), 0.0)
-        after = ProbeTangent(tangent, largest, jnp.ones_like(probe.counts))
-        return Probed(y1, after), (error, errors), dense, state1, result
+        before, h = probe.elapsed, lax.stop_gradient(jnp.abs(t1 - t0))
+        after = None if before is None else before + h
 
-    def _size(self, times: tuple[Array, Array], error: PyTree, of_probe: PyTree, largest: PyTree, y: PyTree) -> Array:
+        def passed(d: Array, x: Array) -> Array:
+            return jnp.maximum(jnp.abs(d), x) if after is None else (before * x + h * jnp.abs(d)) / after
+
+        magnitude = jtu.tree_map(passed, _integrated(tangent[0]), probe.magnitude)
+        ends = jtu.tree_map(lambda a, b: jnp.maximum(jnp.abs(a), jnp.abs(b)), _integrated(held), _integrated(y1))
+        errors = jnp.where(probe.counts > 0, self._size((t0, t1), error, error_of_probe, magnitude, ends), 0.0)
+        moved = ProbeTangent(tangent, magnitude, after, jnp.ones_like(probe.counts))
+        return Probed(y1, moved), (error, errors), dense, state1, result
+
+    def _size(self, times: tuple[Array, Array], error: PyTree, of_probe: PyTree, magnitude: PyTree, y: PyTree) -> Array:
         """Size of the probe's error in parts of its tolerance."""
         control = _pid(self.controller)[0]
         rtol, atol = lax.stop_gradient((control.rtol, control.atol))
@@ -128,18 +146,18 @@ class ProbedStep(NamedTuple):
         shortest = jnp.maximum(dtmin, float(jnp.finfo(t0.dtype).eps) * jnp.maximum(jnp.abs(t0), jnp.abs(t1)))
         short = lax.stop_gradient(t1 - t0 < _SHORT * shortest)
 
-        def size(of_state: Array, of_tangent: Array, largest: Array, y: Array) -> Array:
+        def size(of_state: Array, of_tangent: Array, magnitude: Array, y: Array) -> Array:
             of_state, tolerance = jnp.abs(of_state), atol + rtol * y
             moves = jnp.minimum(1.0, of_state / (_MOVES * tolerance))
             eps = float(jnp.finfo(y.dtype).eps)
             resolved = jnp.where(short, _OVER_A_KINK * eps**0.5, _RESOLVED * eps)
             relative = jnp.maximum(_AT_REST * (1.0 + (_IN_MOTION - 1.0) * moves) * rtol, resolved)
-            tangent = jnp.maximum(largest, _OF_ARRAY * jnp.max(largest))
+            tangent = jnp.maximum(magnitude, _OF_ARRAY * jnp.max(magnitude))
             noise = _OF_ATOL * atol + _ROUNDINGS * eps * y
             noise = noise + jnp.minimum(_OF_ERROR * of_state, _OF_TOLERANCE * tolerance)
             return jnp.sqrt(jnp.mean(jnp.square(of_tangent / (relative * tangent + noise))))
 
-        return jnp.max(jnp.stack(jtu.tree_leaves(jtu.tree_map(size, error, of_probe, largest, y))))
+        return jnp.max(jnp.stack(jtu.tree_leaves(jtu.tree_map(size, error, of_probe, magnitude, y))))
 
 
 class ProbedController(NamedTuple):
