@@ -77,10 +77,8 @@ class AbstractOverSteps:
 
     def __init__(self, by: StepInputs, run: RecordedRun):
         self.inputs, self.final, self.steps, self.how = run
-        program = run.inputs[:2]
-        # The differentiated numbers of the step and of the functions of `SaveAt`, None elsewhere, and the rest.
-        self.numbers = jtu.tree_map(lambda d, x: None if d is None else x, by[:2], program, is_leaf=is_none)
-        self.constants = jtu.tree_map(lambda d, x: x if d is None else None, by[:2], program, is_leaf=is_none)
+        # Of the step and of the functions of `SaveAt`.
+        self.numbers, self.constants = split(by[:2], run.inputs[:2])
         self.count = jnp.asarray(run.final.num_accepted_steps)
         self.saves = [x for x in jtu.tree_leaves(run.final.save_state, is_leaf=is_save_state) if is_save_state(x)]
 
@@ -464,6 +462,11 @@ def is_none(x: object) -> bool:
 
 def _numbers(tree: PyTree) -> PyTree:
     return eqx.filter(tree, eqx.is_inexact_array)
+
+
+def split(by: PyTree, program: PyTree) -> tuple[PyTree, PyTree]:
+    """The numbers of a program by which it is differentiated, None elsewhere, and the rest."""
+    return eqx.partition(program, jtu.tree_map(lambda d, _: d is not None, by, program, is_leaf=is_none))
 
 
 def filled(change: PyTree, like: PyTree) -> PyTree:

@@ -14,7 +14,7 @@ from jax import lax
 from jaxtyping import Array, PyTree
 
 from .._core.arrays import Real
-from ._over_steps import filled, is_none
+from ._over_steps import filled, is_none, split
 from .events._state import EventState
 
 # Change in a number that is zero, which has no magnitude.
@@ -113,8 +113,7 @@ class ProbedStep(NamedTuple):
     def __call__(self, t0: Array, t1: Array, y: Probed, state: PyTree, jump: Real) -> tuple[Any, ...]:
         """The step; its error estimate is a pair: that of the state, and the size of that of the probe."""
         held, probe = y.y, y.probe
-        numbers = jtu.tree_map(lambda d, x: None if d is None else x, self.change, self.step, is_leaf=is_none)
-        rest = jtu.tree_map(lambda d, x: x if d is None else None, self.change, self.step, is_leaf=is_none)
+        numbers, rest = split(self.change, self.step)
         moving, others = eqx.partition((_moving(held), state), eqx.is_inexact_array)
 
         def advance(numbers: PyTree, moving: PyTree) -> tuple[PyTree, PyTree]:
@@ -126,17 +125,16 @@ class ProbedStep(NamedTuple):
         (_, _), (tangent, error_of_probe), (y1, error, dense, state1, result) = jax.jvp(
             advance, (numbers, moving), (self.change, probe.tangent), has_aux=True
         )
-        before, h = probe.elapsed, lax.stop_gradient(jnp.abs(t1 - t0))
-        after = None if before is None else before + h
-
-        def passed(d: Array, x: Array) -> Array:
-            return jnp.maximum(jnp.abs(d), x) if after is None else (before * x + h * jnp.abs(d)) / after
-
-        magnitude = jtu.tree_map(passed, _integrated(tangent[0]), probe.magnitude)
+        now, elapsed, h = jtu.tree_map(jnp.abs, _integrated(tangent[0])), probe.elapsed, jnp.abs(t1 - t0)
+        if elapsed is None:
+            magnitude = jtu.tree_map(jnp.maximum, now, probe.magnitude)
+        else:
+            elapsed = elapsed + h
+            magnitude = jtu.tree_map(lambda d, x: x + h / elapsed * (d - x), now, probe.magnitude)
         ends = jtu.tree_map(lambda a, b: jnp.maximum(jnp.abs(a), jnp.abs(b)), _integrated(held), _integrated(y1))
         errors = jnp.where(probe.counts > 0, self._size((t0, t1), error, error_of_probe, magnitude, ends), 0.0)
-        moved = ProbeTangent(tangent, magnitude, after, jnp.ones_like(probe.counts))
-        return Probed(y1, moved), (error, errors), dense, state1, result
+        after = ProbeTangent(tangent, magnitude, elapsed, jnp.ones_like(probe.counts))
+        return Probed(y1, after), (error, errors), dense, state1, result
 
     def _size(self, times: tuple[Array, Array], error: PyTree, of_probe: PyTree, magnitude: PyTree, y: PyTree) -> Array:
         """Size of the probe's error in parts of its tolerance."""
