@@ -210,10 +210,12 @@ class Dynamics(NamedTuple):
             atol.append(jnp.where(gaps > 0, 0.0, tolerances[1] + rounding))
             roots.append(jnp.where(gaps > 0, 0.0, rounding))
         if sides.size:
-            kinks, none = self.scene.num_kinks, jnp.zeros_like(sides)
+            loads, of_loads = self.guide_loads
+            values = jnp.concatenate([self.scene.side_values(*state), loads])
             # Kinks have the rounding of their numbers as a hysteresis, as they may stay near zero.
-            rounding = none.at[sides.size - kinks :].set(self.unbound.kink_rounding(*state, rest)) if kinks else none
-            guards.append(sides * self.scene.side_values(*state) + rounding)
+            rounding = jnp.concatenate([self.unbound.kink_rounding(*state, rest), of_loads])
+            rounding = jnp.concatenate([jnp.zeros(sides.size - rounding.size, rounding.dtype), rounding])
+            guards.append(sides * values + rounding)
             atol.append(rounding)
             roots.append(rounding)
         return tuple(jnp.concatenate(each) for each in (guards, atol, roots))
@@ -317,6 +319,17 @@ class Dynamics(NamedTuple):
         return self.scene.split_modes(self.mode)
 
     @property
+    def guide_loads(self) -> tuple[Float[Array, " guides"], Float[Array, " guides"]]:
+        """Normal forces of `Scene.guides` [N], negative if they pull, and their rounding errors."""
+        none = jnp.zeros(0, self.t.dtype)
+        if not self.scene.guides:
+            return none, none
+        assert self.friction is not None
+        assert self.friction_elements.loads is not None
+        at = np.array([self.scene.loaded.index(name) for name in self.scene.guides])
+        return self.friction.normal[at], self.friction_elements.loads.rounding[at]
+
+    @property
     def contact_forces(self) -> Float[Array, " n"]:
         """Multipliers of the contacts, negative if a closed one would pull."""
         assert self.multipliers is not None
@@ -372,11 +385,15 @@ def load_and_mobility(
 def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> Dynamics:
     """Solve for the accelerations, and for the forces that depend on them, for the modes `mode`.
 
+    Those of kinks (`Scene.num_kinks`) may be zero, or left out: friction is then that on the side of the state.
+
     **Returns:**
 
     The `Dynamics` at this state: accelerations `qdd`, shape `[dof]`, forces, reactions, powers and guards.
     """
     q, qd, unbound = y.q, y.qd, scene
+    if mode is not None and scene.num_kinks:
+        mode = jnp.pad(mode, (0, scene.num_modes(q.shape[0]) - mode.shape[0]))
     scene = scene.bind_state(t, q, qd)
     params = scene.params
     rhs, mobility = load_and_mobility(scene, scene.constraints_in(mode), t, q, qd)
@@ -384,10 +401,11 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
     compliant = _compliant(scene, t, y) if scene.compliant else None
     if compliant is not None:
         rhs = rhs + compliant.generalised
-    sides = {}
+    sides, of_guides = {}, {name: jnp.zeros_like(t) for name in scene.guides}
     if mode is not None:
         values = jax.lax.stop_gradient(scene.split_modes(mode)[2])
         sides, scene = dict(zip(scene.switches, values, strict=False)), scene.on_sides(values)
+        of_guides = dict(zip(of_guides, values[values.size - len(of_guides) :], strict=True))
     for name, effect in zip(scene.names, scene.effects, strict=True):
         if name in scene.event_driven or name in scene.reaction_loaded:
             continue
@@ -421,12 +439,15 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
 
     qdd, minv_jt = moves[:, 0], moves[:, 1:].T
     along, loads, rounding = jnp.concatenate(directions), None, None
-    if multipliers is not None and yields is not None:
+    if linearized is not None and multipliers is not None and yields is not None:
         unit = _ROUNDING * float(jnp.finfo(q.dtype).eps)
         rate = unit * jnp.sum(jnp.abs(along * free[None, :, 0]), axis=1) if scene.contacts else None
         rounding = unit * jnp.sum(along.T * free[:, 1:], axis=0), rate
         if scene.loaded:
-            loads = _loads(scene, t, y, [len(each) for each in directions], multipliers, yields)
+            size = jnp.sum(jnp.abs(linearized.rows * free[None, :, 0]), axis=1) + jnp.abs(linearized.bias)
+            size, scale = jax.lax.stop_gradient((size, jnp.diagonal(linearized.matrix)))
+            size = unit * size / jnp.where(scale > 0, scale, 1.0)
+            loads = _loads(scene, t, y, [len(each) for each in directions], multipliers, yields, of_guides, size)
     modes = jnp.zeros(0, q.dtype) if mode is None else scene.split_modes(mode)[0]
     elements = assemble_friction(friction, along, minv_jt, rounding, loads, t, q, qd, params, qdd, modes)
     solved = solve_friction_forces(elements, modes)
@@ -451,10 +472,13 @@ def _loads(
     widths: list[int],
     multipliers: Float[Array, " m"],
     yields: Float[Array, "m n"],
+    sides: dict[str, Scalar],
+    rounding: Float[Array, " m"],
 ) -> Loads:
     """Normal forces of the constraints that load friction, and their change by the friction forces.
 
     `widths`: the number of rows of each element. `yields`: change of the multipliers with unit forces along the rows.
+    `sides`: signs of the loads of guides. `rounding`: errors of the multipliers.
     """
     names, friction = scene.loaded, (*scene.event_driven.values(), *scene.reaction_loaded.values())
     loaded = [x.load_constraint for x, width in zip(friction, widths, strict=True) for _ in range(width)]
@@ -467,6 +491,8 @@ def _loads(
         size * multipliers[at],
         size[:, None] * yields[at],
         jnp.asarray([0.0 if isinstance(chosen[name], Contact) else -1.0 for name in names], y.q.dtype),
+        jnp.stack([sides.get(name, jnp.zeros_like(t)) for name in names]),
+        jax.lax.stop_gradient(jnp.abs(size)) * rounding[at],
     )
 
 

@@ -72,12 +72,16 @@ class Loads(NamedTuple):
     - `normal`: normal forces without the elements [N], shape `[k]`; negative ones pull.
     - `normal_coupling`: C, by which unit forces of the rows reduce the normal forces, shape `[k, n]`.
     - `pulls`: -1 for constraints whose friction is as large when they pull, 0 for those that can only push.
+    - `side`: sign of a normal force that counts in its place, so that friction is smooth where it changes; 0 for none.
+    - `rounding`: rounding errors of the normal forces [N].
     """
 
     on: Float[Array, "n k"]
     normal: Float[Array, " k"]
     normal_coupling: Float[Array, "k n"]
     pulls: Float[Array, " k"]
+    side: Float[Array, " k"]
+    rounding: Float[Array, " k"]
 
 
 class PlanarSlip(NamedTuple):
@@ -182,12 +186,14 @@ class FrictionForces(NamedTuple):
     - `upper`, `lower`: limits of stick [N].
     - `margin`: margin of uniqueness of loads that are reactions: 1 without friction, never more; not positive where
       there is no solution, or more than one.
+    - `normal`: the normal forces of `Loads` [N]; negative ones pull.
     """
 
     force: Float[Array, " n"]
     upper: Float[Array, " n"]
     lower: Float[Array, " n"]
     margin: Scalar
+    normal: Float[Array, " k"]
 
 
 def assemble_friction(
@@ -275,7 +281,7 @@ def solve_friction_forces(
         slipping = jnp.where(sticks, 0.0, slip_force)
         drive = elements.free_slip_acceleration - apply_matrix(elements.delassus, slipping)
         force = jnp.where(sticks, _multipliers(elements, drive, sticks), slip_force)
-        return FrictionForces(force, elements.upper, elements.lower, jnp.ones_like(elements.v[0]))
+        return FrictionForces(force, elements.upper, elements.lower, jnp.ones_like(elements.v[0]), force[:0])
     # Forces are linear in the loads. Columns: the slip forces without loads, beside the accelerations without friction;
     # then the slip forces by one newton of each load alone.
     on, coupling = elements.loads.on, elements.loads.normal_coupling
@@ -288,16 +294,18 @@ def solve_friction_forces(
     fixed, per_load = forces[:, 0], forces[:, 1:]
     normal = elements.loads.normal - apply_matrix(coupling, fixed)
     gain = apply_matrix(coupling, per_load)
-    load, margin = _solve_loads(normal, gain, elements.loads.pulls)
+    load, signed, margin = _solve_loads(normal, gain, elements.loads.pulls, elements.loads.side)
     factor = jnp.where(loaded > 0, apply_matrix(on, load), 1.0)
     force = fixed + apply_matrix(per_load, load)
-    return FrictionForces(force, factor * elements.upper, factor * elements.lower, margin)
+    return FrictionForces(force, factor * elements.upper, factor * elements.lower, margin, signed)
 
 
 def _solve_loads(
-    normal: Float[Array, " k"], gain: Float[Array, "k k"], pulls: Float[Array, " k"]
-) -> tuple[Float[Array, " k"], Scalar]:
-    """Loads and margin of `n + gain load(n) = normal`, where `load(n)` is `n` for n >= 0 and `pulls n` otherwise.
+    normal: Float[Array, " k"], gain: Float[Array, "k k"], pulls: Float[Array, " k"], side: Float[Array, " k"]
+) -> tuple[Float[Array, " k"], Float[Array, " k"], Scalar]:
+    """Loads, `n` and margin of `n + gain load(n) = normal`, where `load(n)` is `n` for n >= 0 and `pulls n` otherwise.
+
+    A `side` that is not zero takes the place of the sign of n.
 
     The margin is the smallest determinant of `I + gain S` over all slopes S. The determinant is linear in each slope,
     so if it is positive at the ends of their ranges it is so in between, and then the solution is unique (J. Rohn,
@@ -305,9 +313,9 @@ def _solve_loads(
     """
     k = normal.shape[0]
     if k == 1:
-        slope = jnp.where(normal >= 0, 1.0, pulls)
-        load = slope * normal / (1.0 + gain[0] * slope)
-        return load, jnp.minimum(1.0 + gain[0, 0], 1.0 + gain[0, 0] * pulls[0])
+        slope = jnp.where(jnp.where(side == 0, normal, side) >= 0, 1.0, pulls)
+        signed = normal / (1.0 + gain[0] * slope)
+        return slope * signed, signed, jnp.minimum(1.0 + gain[0, 0], 1.0 + gain[0, 0] * pulls[0])
 
     # Cramer's rule for all choices of slopes at once: entries are vectors of length 2^k.
     takes = np.array(list(product((False, True), repeat=k))).T
@@ -318,12 +326,14 @@ def _solve_loads(
     for j in range(k):
         replaced = [[*row[:j], right[i] + 0.0 * row[j], *row[j + 1 :]] for i, row in enumerate(rows)]
         signed = _determinant(replaced) / jnp.where(divisor == 0, jnp.nan, divisor)
-        violation = violation + jnp.maximum(jnp.where(takes[j], signed, -signed), 0.0)
+        opposed = jnp.where(side[j] == 0, signed, side[j] * jnp.inf)
+        violation = violation + jnp.maximum(jnp.where(takes[j], opposed, -opposed), 0.0)
     # The choice whose signs agree with its slopes; two agree where a load is zero, and either is right.
     best = jnp.min(jnp.where(jnp.isnan(violation), jnp.inf, violation))
     slope = jnp.where(jnp.any(takes & (violation <= best)[None, :], axis=1), pulls, 1.0)
     signed = jnp.stack(factor_lu(_rows(gain, _constant(slope)), pivot=True)(list(jnp.unstack(normal))))
-    return jnp.where(signed >= 0, 1.0, pulls) * signed, jnp.min(determinant)
+    slope = jnp.where(side == 0, jnp.where(signed >= 0, 1.0, pulls), slope)
+    return slope * signed, signed, jnp.min(determinant)
 
 
 def _rows(gain: Float[Array, "k k"], slope: Float[Array, "k *m"]) -> list[list[Array]]:
@@ -489,7 +499,7 @@ def next_modes(
 
     def improve(i: Array, mode: Array) -> Array:
         now = _constant(mode)
-        all_forces, upper, lower, _ = solve_friction_forces(elements, now, still)
+        all_forces, upper, lower, *_ = solve_friction_forces(elements, now, still)
         force = all_forces[:n]
         limit = jnp.where(force > 0, upper[:n], lower[:n])
         least = float(jnp.finfo(limit.dtype).tiny)

@@ -291,7 +291,7 @@ class Scene(AbstractReadable, eqx.Module):
     @property
     def num_kinks(self) -> int:
         """Number of kinks, see `side_values`, whose signs follow the modes of `mode_names` in an array of modes."""
-        return sum(each.num_kinks for each in self.event_driven.values())
+        return sum(each.num_kinks for each in self.event_driven.values()) + len(self.guides)
 
     def split_modes(self, modes: Array) -> tuple[Array, Array, Array]:
         """An array over the modes in three parts: of the friction elements, of the contacts, of switches and kinks."""
@@ -304,15 +304,20 @@ class Scene(AbstractReadable, eqx.Module):
         return sum(self.mode_widths(dof)) + self.num_kinks
 
     def side_values(self, t: Scalar, q: PerDof, qd: PerDof) -> Float[Array, " sides"]:
-        """Guards of the switches; then kinks: zeros of these numbers end a step, as friction has a kink there."""
+        """Guards of the switches, then kinks of laws: zeros of these numbers end a step, too.
+
+        The kinks of `guides` follow; their numbers are loads.
+        """
         params = self.bind_time(t).params
-        return jnp.stack([*(each.value(t, q, qd, params) for each in self.switches.values()), *self._kinks(t, q, qd)])
+        values = [*(each.value(t, q, qd, params) for each in self.switches.values()), *self._kinks(t, q, qd)]
+        return jnp.stack(values) if values else jnp.zeros(0, q.dtype)
 
     def kink_rounding(self, t: Scalar, q: PerDof, qd: PerDof, rest: Scalar) -> Float[Array, " kinks"]:
-        """Rounding errors of the kinks, constant; at least those of the changes `rest` of q and qd."""
+        """Rounding errors of the kinks of laws, constant; at least those of the changes `rest` of q and qd."""
         held = jax.lax.stop_gradient(self)
-        kinks = [lambda *at, i=i: held._kinks(*at)[i] for i in range(self.num_kinks)]
-        return jnp.stack([rounding_of(kink, t, q, qd, least=(rest, rest)) for kink in kinks])
+        kinks = [lambda *at, i=i: held._kinks(*at)[i] for i in range(self.num_kinks - len(self.guides))]
+        found = [rounding_of(kink, t, q, qd, least=(rest, rest)) for kink in kinks]
+        return jnp.stack(found) if found else jnp.zeros(0, q.dtype)
 
     def _kinks(self, t: Scalar, q: PerDof, qd: PerDof) -> list[Scalar]:
         params = self.bind_time(t).params
@@ -346,6 +351,12 @@ class Scene(AbstractReadable, eqx.Module):
         """Names of the constraints whose reactions are loads of friction."""
         resting = {each.load_constraint for each in (*self.event_driven.values(), *self.reaction_loaded.values())}
         return tuple(name for name in self.constraint_names if name in resting)
+
+    @property
+    def guides(self) -> tuple[str, ...]:
+        """Names of the constraints that load event-driven friction whether they push or pull: it has a kink at zero."""
+        resting = {each.load_constraint for each in self.event_driven.values()}
+        return tuple(name for name in self.loaded if name in resting and name not in self._all_contacts)
 
     @property
     def checks(self) -> tuple[str, ...]:

@@ -338,13 +338,52 @@ def test_loads_that_depend_on_each_other(k: int) -> None:
     for _ in range(200):
         gain, normal = rng.normal(scale=0.6, size=(k, k)), rng.normal(size=k)
         pulls = rng.choice([0.0, -1.0], size=k)
-        load, margin = solve(jnp.asarray(normal), jnp.asarray(gain), jnp.asarray(pulls))
+        load, n, margin = solve(jnp.asarray(normal), jnp.asarray(gain), jnp.asarray(pulls), jnp.zeros(k))
         solutions = all_loads(normal, gain, pulls)
         counts[bool(margin > 0)] += 1
         if margin > 0:
             assert len(solutions) == 1
             np.testing.assert_allclose(load, solutions[0], atol=1e-10)
+            given = jnp.sign(n) * rng.choice([0.0, 1.0], size=k)
+            np.testing.assert_allclose(solve(normal, gain, pulls, given)[0], load, atol=1e-10)
+            one = rng.integers(k)  # beyond its zero a load goes on
+            beyond = solve(normal, gain, pulls, jnp.zeros(k).at[one].set(-jnp.sign(n[one])))
+            np.testing.assert_allclose(beyond[0][one], (pulls[one] if n[one] > 0 else 1.0) * beyond[1][one], atol=1e-10)
     assert min(counts.values()) > 10
+
+
+def test_a_step_ends_where_the_load_of_a_guide_changes_its_sign() -> None:
+    """Y'' = A cos(w t) across the guide: v' = -mu A |cos(w t)| along it, and its double integral by pieces."""
+
+    def track(t: Any, q: Any, p: Any) -> Any:
+        return q[1] + p["A"] / p["w"] ** 2 * jnp.cos(p["w"] * t)
+
+    def place(x: Any) -> Any:
+        guide, friction = (
+            Constraint(track, name="guide"),
+            Friction(Coulomb(x["mu"]), along=lambda q: q[0], normal_force="guide"),
+        )
+        scene = Scene(free, {"A": x["A"], "w": x["w"]}, (friction,), (guide,))
+        start = jnp.stack([0.0 * x["A"], -x["A"] / x["w"] ** 2])
+        run = simulate(scene, start, [5.0, 0.0], 3.0, throw=False)
+        return run.q[-1, 0], run.stats
+
+    def exact(x: Any) -> Any:
+        w = x["w"]
+        ends = jnp.stack([0.0 * w, *((0.5 + j) * jnp.pi / w for j in range(6)), 3.0 + 0.0 * w])
+
+        def part(s: Any) -> Any:
+            return (3.0 - s) * jnp.sin(w * s) / w - jnp.cos(w * s) / w**2
+
+        return 15.0 - x["mu"] * x["A"] * jnp.sum((-1.0) ** jnp.arange(7) * jnp.diff(part(ends)))
+
+    at = {"mu": 0.2, "A": 4.0, "w": 6.0}
+    ours, stats = jax.jit(place)(at)
+    slopes = jax.jit(jax.grad(lambda x: place(x)[0]))(at)
+    assert abs(ours - exact(at)) < 1e-6
+    assert int(stats["num_events"]) == 0
+    for name, slope in jax.grad(exact)(at).items():
+        assert abs(slopes[name] - slope) * at[name] < 1e-6, name
 
 
 # --- What is refused ------------------------------------------------------------------------------------------------

@@ -62,7 +62,8 @@ def test_stick_takes_the_acceleration_that_slip_leaves() -> None:
 @pytest.mark.parametrize(("pulls", "normal"), [(0.0, 10.0), (0.0, -10.0), (-1.0, -10.0)])
 def test_a_reaction_as_load_is_solved_with_the_friction_under_it(pulls: float, normal: float) -> None:
     """n = normal - 0.4 f with f = 0.5 |n|, or 0.5 max(n, 0) of a contact."""
-    loads = Loads(jnp.array([[1.0], [0.0]]), jnp.array([normal]), jnp.array([[0.4, 0.0]]), jnp.array([pulls]))
+    on, coupling, none = jnp.array([[1.0], [0.0]]), jnp.array([[0.4, 0.0]]), jnp.zeros(1)
+    loads = Loads(on, jnp.array([normal]), coupling, jnp.array([pulls]), side=none, rounding=none)
     forces = solve_friction_forces(scalars(loads=loads), jnp.array([1.0, 0.0]))
     load = normal / 1.2 if normal > 0 else -normal / 0.8 if pulls else 0.0
     np.testing.assert_allclose(forces.force, [0.5 * load, (1.0 - 0.5 * load) / 2.0], rtol=1e-13)
