@@ -1,6 +1,7 @@
 """The behaviour bench: what laws do in the standard experiments, by numbers and closed forms."""
 
 import dataclasses
+import functools
 import inspect
 from typing import TypeVar
 
@@ -27,10 +28,18 @@ KINDS = ("Coulomb", "Coulomb, stiction", "Regularized", "Dahl", "LuGre", "Elasto
 
 
 @pytest.fixture(scope="module")
-def outcomes():
-    prescribed = run_bench(experiments=PRESCRIBED)
-    with_mass = run_bench([BENCH[name] for name in KINDS], {name: EXPERIMENTS[name] for name in WITH_MASS})
-    return {name: prescribed[name] | with_mass.get(name, {}) for name in prescribed}
+def prescribed():
+    return run_bench(experiments=PRESCRIBED)
+
+
+@functools.cache
+def with_mass(law):
+    return run_bench([BENCH[law]], {name: EXPERIMENTS[name] for name in WITH_MASS})[law]
+
+
+@pytest.fixture(scope="module")
+def outcomes(prescribed):
+    return {name: each | (with_mass(name) if name in KINDS else {}) for name, each in prescribed.items()}
 
 
 @pytest.mark.quick
@@ -103,14 +112,14 @@ PASS, KNOWN, NOT = Verdict.PASS, Verdict.KNOWN_LIMITATION, Verdict.NOT_APPLICABL
         ("MaxwellSlip, 4, C", "passivity", PASS),
     ],
 )
-def test_verdicts(outcomes, law, experiment, verdict):
-    outcome = outcomes[law][experiment]
+def test_verdicts(prescribed, law, experiment, verdict):
+    outcome = (with_mass(law) if experiment in WITH_MASS else prescribed[law])[experiment]
     assert outcome.verdict is verdict, outcome.measured.sentence
     assert (verdict is PASS) == (outcome.reason == "")
 
 
-def test_every_law_has_its_steady_curve(outcomes):
-    for law, of in outcomes.items():
+def test_every_law_has_its_steady_curve(prescribed):
+    for law, of in prescribed.items():
         # Armstrong's stiction is not all back after a reversal; forward its curve is right, too.
         assert of["characteristic"].verdict is (KNOWN if law == "Armstrong" else PASS), law
 
@@ -180,9 +189,9 @@ def test_limitations_name_experiments_and_every_one_is_missed(outcomes):
     assert "creep" in BENCH["LuGre, asymmetric"].law.known_limitations()
 
 
-def test_figures_have_a_panel_for_each_law_and_labelled_axes(outcomes):
+def test_figures_have_a_panel_for_each_law_and_labelled_axes(prescribed):
     for name, experiment in PRESCRIBED.items():
-        of = {law: found[name] for law, found in outcomes.items()}
+        of = {law: found[name] for law, found in prescribed.items()}
         figure = behaviour_figure(experiment, of)
         titles = [axis.get_title(loc="left") for axis in figure.axes]
         assert [title for title in titles if title] == list(of)
@@ -206,9 +215,9 @@ def test_the_study_records_verdicts_and_draws_figures(tmp_path, monkeypatch, out
     assert recorded.get("reason", case="creep", peer="ElastoPlastic") is None
 
 
-def test_a_failure_ends_the_study_with_an_error(tmp_path, monkeypatch, outcomes):
-    failure = dataclasses.replace(outcomes["Dahl"]["creep"], verdict=Verdict.FAIL, reason="")
-    failed = {"Dahl": outcomes["Dahl"] | {"creep": failure}}
+def test_a_failure_ends_the_study_with_an_error(tmp_path, monkeypatch, prescribed):
+    failure = dataclasses.replace(with_mass("Dahl")["creep"], verdict=Verdict.FAIL, reason="")
+    failed = {"Dahl": prescribed["Dahl"] | with_mass("Dahl") | {"creep": failure}}
     monkeypatch.setattr(behaviour, "run_bench", lambda laws, progress: failed)
     with pytest.raises(RuntimeError, match="FAIL: Dahl, creep, 1"):
         behaviour.main(False, tmp_path)

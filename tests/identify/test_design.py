@@ -54,6 +54,14 @@ def design() -> InputDesign:
         return design_input(box(), MODEL.free, LIMITS, max_steps=15, seed=1, **OPTIONS)
 
 
+@pytest.fixture(scope="module")
+def rough() -> InputDesign:
+    """After one step."""
+    with pytest.MonkeyPatch.context() as patch:
+        shorten(patch, 2, 1)
+        return design_input(box(), MODEL.free, LIMITS, max_steps=1, **OPTIONS)
+
+
 def as_arrays(each):
     return jnp.asarray(each.t), jnp.asarray(each.force)
 
@@ -278,37 +286,37 @@ def test_what_cannot_be_learned_is_said_and_keeps_the_goal_finite(design):
     assert still.best.errors["friction.Fs"] > 1e3 * design.best.errors["friction.Fs"]
 
 
-def test_csv_holds_the_motion_and_the_force_and_is_whole_or_not_there(design, tmp_path):
+def test_csv_holds_the_motion_and_the_force_and_is_whole_or_not_there(rough, tmp_path):
     path = tmp_path / "input.csv"
-    design.to_csv(path)
+    rough.to_csv(path)
     assert path.read_text().startswith("t,q_ref,qd_ref,force\n")
     t, q_ref, qd_ref, force = np.loadtxt(path, delimiter=",", skiprows=1).T
     for column, expected in (
-        (t, design.best.t),
-        (q_ref, design.best.q_ref),
-        (qd_ref, design.best.qd_ref),
-        (force, design.best.force),
+        (t, rough.best.t),
+        (q_ref, rough.best.q_ref),
+        (qd_ref, rough.best.qd_ref),
+        (force, rough.best.force),
     ):
         np.testing.assert_allclose(column, expected, rtol=1e-8, atol=1e-12)
     assert np.max(np.abs(force)) <= 40.0
     (tmp_path / "folder.csv").mkdir()
     with pytest.raises(OSError, match=r"folder\.csv"):
-        design.to_csv(tmp_path / "folder.csv")
+        rough.to_csv(tmp_path / "folder.csv")
     assert sorted(each.name for each in tmp_path.iterdir()) == ["folder.csv", "input.csv"]
 
 
-def test_the_result_prints_goes_to_json_and_is_drawn(design):
-    text = str(design)
+def test_the_result_prints_goes_to_json_and_is_drawn(rough):
+    text = str(rough)
     assert "friction.sigma0" in text
     assert "plain sine" in text
-    report = json.loads(json.dumps(design.to_dict(), allow_nan=False))
+    report = json.loads(json.dumps(rough.to_dict(), allow_nan=False))
     assert report["parameters"]["friction.vs"]["unit"] == "m/s"
-    assert report["parameters"]["m"]["standard_error"] == design.best.errors["m"]
-    figure = design_figure(design, caption="LuGre")
+    assert report["parameters"]["m"]["standard_error"] == rough.best.errors["m"]
+    figure = design_figure(rough, caption="LuGre")
     axes = [axis for part in figure.subfigs for axis in part.axes]
     assert [axis.get_ylabel() for axis in axes[:3]] == ["position [mm]", "velocity [m/s]", "force [N]"]
     assert [sum(line.get_linestyle() == "--" for line in axis.get_lines()) for axis in axes[:3]] == [2, 2, 2]
-    assert len(axes[3].patches) == 2 * len(design.values)
+    assert len(axes[3].patches) == 2 * len(rough.values)
     assert "%" in axes[3].get_xlabel()
 
 

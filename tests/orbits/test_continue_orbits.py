@@ -288,7 +288,7 @@ def test_folds_of_duffing_and_a_branch_that_resumes_from_its_store(tmp_path):
         follow(out=tmp_path / "other")
 
 
-def test_garbage_is_refused(ball):
+def test_garbage_is_refused():
     scene = duffing(0.8)
     start = ([0.0], [0.0])
     with pytest.raises(ValueError, match="Did you mean 'friction"):
@@ -299,5 +299,8 @@ def test_garbage_is_refused(ball):
         jms.continue_orbits(scene, start, "W", (0.1, 0.1), period=of_frequency)
     with pytest.raises(ValueError, match="step must be one finite number > 0"):
         jms.continue_orbits(scene, start, "W", (0.1, 0.2), period=of_frequency, step=0.0)
+
+
+def test_a_guess_below_the_table_is_refused(ball):
     with pytest.raises(OrbitError):
         ball_branch(ball, ([-1.0], [0.0]), 1e-3)

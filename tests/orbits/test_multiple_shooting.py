@@ -45,9 +45,12 @@ def test_an_orbit_too_unstable_for_a_run_over_the_period(a):
     np.testing.assert_allclose(slopes["W"], -2 / (1 + a**2) ** 2, rtol=1e-8)
 
 
-def test_single_shooting_fails_and_invalid_arguments_are_refused():
+def test_single_shooting_fails():
     with pytest.raises(OrbitError, match="pass more `segments`"):
         on_a_hill(5.0, 1)
+
+
+def test_invalid_arguments_are_refused():
     scene, orbit = on_a_hill(2.2, 4)
     with pytest.raises(ValueError, match="in 4 segments: it has one run each"):
         _ = orbit.run
