@@ -213,8 +213,8 @@ class Dynamics(NamedTuple):
             loads, of_loads = self.guide_loads
             values = jnp.concatenate([self.scene.side_values(*state), loads])
             # Kinks have the rounding of their numbers as a hysteresis, as they may stay near zero.
-            rounding = jnp.concatenate([self.unbound.kink_rounding(*state, rest), of_loads])
-            rounding = jnp.concatenate([jnp.zeros(sides.size - rounding.size, rounding.dtype), rounding])
+            none = jnp.zeros(len(self.scene.switches), sides.dtype)
+            rounding = jnp.concatenate([none, self.unbound.kink_rounding(*state, rest), of_loads])
             guards.append(sides * values + rounding)
             atol.append(rounding)
             roots.append(rounding)
@@ -392,8 +392,8 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
     The `Dynamics` at this state: accelerations `qdd`, shape `[dof]`, forces, reactions, powers and guards.
     """
     q, qd, unbound = y.q, y.qd, scene
-    if mode is not None and scene.num_kinks:
-        mode = jnp.pad(mode, (0, scene.num_modes(q.shape[0]) - mode.shape[0]))
+    if mode is not None and scene.num_kinks and (left_out := scene.num_modes(q.shape[0]) - mode.shape[0]):
+        mode = jnp.pad(mode, (0, left_out))
     scene = scene.bind_state(t, q, qd)
     params = scene.params
     rhs, mobility = load_and_mobility(scene, scene.constraints_in(mode), t, q, qd)

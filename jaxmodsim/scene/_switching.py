@@ -32,22 +32,22 @@ def start(
     slips, closed, sides = scene.split_modes(mode)
     if scene.contacts:
         closed = _start_contacts(t, y, scene, rest)
-    if sides.size > len(scene.guides):
+    sides = _without_guides(sides, scene)
+    if sides.size:
         above = jnp.ones_like(sides).at[len(scene.switches) :].set(0.0)
         sides = _start_sides(t, y, scene, jnp.concatenate([jnp.zeros_like(slips), closed, above]))
     if scene.event_driven:
-        begun = _join(jnp.zeros_like(slips), closed, _without_guides(sides, scene))
+        begun = _join(jnp.zeros_like(slips), closed, sides)
         begin = lambda d: (*d.start_friction(rest), d.guide_loads[0])  # noqa: E731
         y, slips, loads = from_dynamics(begin, t, y, scene, begun)
         # Those of stick, as `begun` says: where slip changes a sign, the guard is violated and changes it at once.
-        loads = jax.lax.stop_gradient(loads)
-        sides = jnp.concatenate([sides[: sides.size - loads.size], jnp.where(loads >= 0, 1.0, -jnp.ones_like(loads))])
+        sides = jnp.concatenate([sides, jnp.where(loads >= 0, 1.0, -jnp.ones_like(loads))])
     return y, _join(slips, closed, sides)
 
 
-def _without_guides(sides: Float[Array, " sides"], scene: Scene) -> Float[Array, " sides"]:
+def _without_guides(sides: Float[Array, " sides"], scene: Scene) -> Float[Array, " others"]:
     """Sides for a search of modes, in which the loads of guides have their own signs: forces jump, and so do loads."""
-    return sides.at[sides.size - len(scene.guides) :].set(0.0) if scene.guides else sides
+    return sides[: sides.size - len(scene.guides)]
 
 
 def _start_contacts(t: Scalar, y: State, scene: Scene, rest: Scalar) -> Float[Array, " contacts"]:
@@ -65,8 +65,7 @@ def _start_sides(t: Scalar, y: State, scene: Scene, mode: Float[Array, " modes"]
     """Sides of switches and kinks; a value of zero has the side of its rate."""
     rate = vector_field(t, y, scene, mode)
     value, pace = jax.jvp(scene.side_values, (t, y.q, y.qd), (jnp.ones_like(t), rate.q, rate.qd))
-    found = jnp.where(jnp.where(value == 0, pace, value) >= 0, 1.0, -jnp.ones_like(value))
-    return jnp.concatenate([found, jnp.ones(len(scene.guides), found.dtype)])
+    return jnp.where(jnp.where(value == 0, pace, value) >= 0, 1.0, -jnp.ones_like(value))
 
 
 def _join(*modes: Array) -> Float[Array, " modes"]:

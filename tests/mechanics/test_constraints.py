@@ -359,10 +359,8 @@ def test_a_step_ends_where_the_load_of_a_guide_changes_its_sign() -> None:
         return q[1] + p["A"] / p["w"] ** 2 * jnp.cos(p["w"] * t)
 
     def place(x: Any) -> Any:
-        guide, friction = (
-            Constraint(track, name="guide"),
-            Friction(Coulomb(x["mu"]), along=lambda q: q[0], normal_force="guide"),
-        )
+        guide = Constraint(track, name="guide")
+        friction = Friction(Coulomb(x["mu"]), along=lambda q: q[0], normal_force="guide")
         scene = Scene(free, {"A": x["A"], "w": x["w"]}, (friction,), (guide,))
         start = jnp.stack([0.0 * x["A"], -x["A"] / x["w"] ** 2])
         run = simulate(scene, start, [5.0, 0.0], 3.0, throw=False)

@@ -83,6 +83,7 @@ def test_any_cut_gives_the_same_numbers(found: xr.Dataset, chunk: int) -> None:
     np.testing.assert_array_equal(other["num_steps"], found["num_steps"])
 
 
+@optimized()
 def test_many_lanes_are_sorted_and_put_back() -> None:
     """More runs than are run without a look ahead, in an order that is not that of their steps."""
     rng = np.random.default_rng(3)
