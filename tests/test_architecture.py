@@ -21,12 +21,12 @@ FILES = sorted(ROOT.rglob("*.py"))
 # never in the wheel. Rooms are in the order of their imports: a room imports only rooms above it, imports for type
 # checkers included; what it takes from another room is among that room's public names. `_core` has none: all of it is
 # private to the package. The number is the budget of lines of a room: to raise it is a decision, whose commit says why.
-CORE = {"_core": 3330, "mechanics": 1577, "friction": 3009, "scene": 3860, "solvers": 4089, "simulation": 3185}
+CORE = {"_core": 3341, "mechanics": 1577, "friction": 3012, "scene": 3871, "solvers": 4101, "simulation": 3186}
 APPLICATIONS = {
     "metrics": 634,
     "analysis": 2136,
     "orbits": 3122,
-    "identify": 9667,
+    "identify": 9669,
     "sweeps": 2093,
     "export": 1906,
     "control": 790,

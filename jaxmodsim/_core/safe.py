@@ -1,11 +1,11 @@
-"""Functions with finite derivatives at zero, and rounding errors."""
+"""Functions with finite derivatives at zero or without derivatives, and rounding errors."""
 
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 # Rounding units in each term of a function.
 _ROUNDING = 4.0
@@ -19,6 +19,17 @@ def safe_power(base: Float[Array, "..."], exponent: Float[Array, "..."]) -> Floa
     """
     positive = base > 0
     return jnp.where(positive, jnp.where(positive, base, 1.0) ** exponent, 0.0)
+
+
+def constant(x: PyTree, why: str) -> PyTree:
+    """`x` itself, whose derivatives raise a `ValueError` with the sentence `why`."""
+
+    def refuse(*_: PyTree) -> PyTree:
+        raise ValueError(why)
+
+    itself = jax.custom_jvp(lambda x: x)
+    itself.defjvp(refuse)
+    return itself(x)
 
 
 def magnitude(v: Float[Array, "..."]) -> Float[Array, ""]:

@@ -122,6 +122,8 @@ class AbstractLaw(AbstractReadable, AbstractRanged):
 
     # Whether the law makes the equations of motion stiff: it selects the default solver.
     stiff: AbstractClassVar[bool]
+    # Whether the force jumps with the velocity and no event marks it, so that JAX cannot differentiate a run.
+    jumps: ClassVar[bool] = False
     description: ClassVar[str] = ""
     equations: ClassVar[tuple[str, ...]] = ()
     execution: ClassVar[str] = "integrated directly"
@@ -208,8 +210,6 @@ class AbstractLaw(AbstractReadable, AbstractRanged):
 class AbstractForceLaw(AbstractLaw):
     """A law whose force is a function of slip velocity."""
 
-    # Whether the force jumps at rest.
-    jumps: ClassVar[bool] = False
     limitations: ClassVar[Mapping[str, str]] = {
         **_JUMPS,
         **_NO_MEMORY,
@@ -270,6 +270,7 @@ def side_of(number: Scalar, sides: Float[Array, " kinks"] | None, kink: int) -> 
 class AbstractKarnoppLaw(AbstractLaw):
     """A law whose force balances the load in a band of velocities about rest."""
 
+    jumps: ClassVar[bool] = True
     limitations: ClassVar[Mapping[str, str]] = _NO_MEMORY
 
     @abc.abstractmethod

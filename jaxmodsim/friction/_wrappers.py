@@ -124,7 +124,8 @@ class DeadZone(AbstractWrapper, AbstractKarnoppLaw):
 
     In the band friction equals the load, up to the limit of stick, so the velocity keeps its value, zero or not.
     Outside the band the slip force of the law acts. Use a fixed step: the vector field jumps at the edges of the band.
-    A step can miss a band that is narrower than its change of velocity.
+    A step can miss a band that is narrower than its change of velocity. JAX does not see the jumps, so that derivatives
+    of a run would be wrong, by up to several times their size: they raise an error.
 
     **Arguments:**
 
@@ -133,7 +134,7 @@ class DeadZone(AbstractWrapper, AbstractKarnoppLaw):
 
     **Raises:**
 
-    - `ValueError` if `law` is not set-valued or `width` is out of range.
+    - `ValueError` if `law` is not set-valued or `width` is out of range, and for derivatives of a run.
 
     **Example:**
 
@@ -186,7 +187,8 @@ class DeadZone(AbstractWrapper, AbstractKarnoppLaw):
 class Sign(AbstractWrapper, AbstractForceLaw):
     """A set-valued law with a plain `sign(v)` and no stick, to demonstrate why that fails.
 
-    A fixed step chatters about zero velocity; an adaptive step becomes arbitrarily small there.
+    A fixed step chatters about zero velocity; an adaptive step becomes arbitrarily small there. Derivatives of a run
+    would lack the jumps: they raise an error.
 
     **Arguments:**
 
@@ -194,7 +196,7 @@ class Sign(AbstractWrapper, AbstractForceLaw):
 
     **Raises:**
 
-    - `ValueError` if `law` is not set-valued.
+    - `ValueError` if `law` is not set-valued, and for derivatives of a run.
 
     **Example:**
 

@@ -254,6 +254,17 @@ class Scene(AbstractReadable, eqx.Module):
         return {name: each for name, each in self.friction.items() if each.event_driven}
 
     @property
+    def without_derivatives(self) -> str:
+        """Why JAX cannot differentiate a run, with the remedy; empty if it can."""
+        laws = [f"{name!r} ({type(each.law).__name__})" for name, each in self.friction.items() if each.law.jumps]
+        if not laws:
+            return ""
+        return (
+            f"No derivatives through friction {', '.join(laws)}: its force jumps with the velocity, which JAX ignores,"
+            " so that they would be wrong. Run the law without this wrapper, by events, or as Regularized(law, width)."
+        )
+
+    @property
     def contacts(self) -> dict[str, Contact]:
         """The contacts that open and close, by name, in the order of their modes."""
         return {name: each for name, each in self._all_contacts.items() if each.compliant is None}

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._core.compat import programs_of
 from .._core.one_kernel import in_one_kernel
+from .._core.safe import constant
 from ..scene import Scene, State, check_scene, has_linear_solver, sample_times, signals_of, vector_field
 from ..solvers import (
     EventController,
@@ -396,6 +397,8 @@ def _kept(
 @jax.jit
 def solve(request: RunRequest) -> RunOutput:
     """Run a scene; the run, and its derivatives, in one kernel each."""
+    if why := request.scene.without_derivatives:
+        request = constant(request, why)
     return in_one_kernel(jax.jit(_integrate), request)
 
 

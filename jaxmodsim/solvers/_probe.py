@@ -24,6 +24,9 @@ _OF_ZERO = 1e-3
 _AT_REST, _IN_MOTION, _MOVES = 0.1, 150.0, 0.01
 # Least magnitude of a tangent, in parts of the largest in its array.
 _OF_ARRAY = 1e-3
+# A tangent that is zero up to a kink of the field begins in proportion to the step over it, as does its error, whatever
+# the step. It counts as large as after this part of a late step, whose length decreases by a factor with each step.
+_SOON, _LATE = 0.01, 0.9
 # Errors of a tangent that are noise: in parts of `atol`, in roundings of the state, and in roundings of the tangent.
 _OF_ATOL, _ROUNDINGS, _RESOLVED = 1e-6, 16.0, 64.0
 # At rest forces cancel up to their rounding, the only error of the state: as an error of the tangent it is at most this
@@ -46,6 +49,8 @@ class ProbeTangent(NamedTuple):
     tangent: tuple[PyTree, PyTree]
     magnitude: PyTree
     elapsed: Array | None
+    # Length [s] of the late steps; see `_LATE`.
+    length: Array
     # 0 in a first step with a projection, else 1. That projection changes the tangent by a jump, which is no error and
     # does not shrink with the step.
     counts: Array
@@ -100,7 +105,7 @@ def start(
     tangent = _moving(tangent), filled(None, solver_state)
     counts = jnp.asarray(1.0 if project is None else 0.0, t0.dtype)
     magnitude, elapsed = jtu.tree_map(jnp.abs, _integrated(tangent[0])), jnp.zeros_like(counts) if brief else None
-    return Probed(y0, ProbeTangent(tangent, magnitude, elapsed, counts))
+    return Probed(y0, ProbeTangent(tangent, magnitude, elapsed, jnp.zeros_like(counts), counts))
 
 
 class ProbedStep(NamedTuple):
@@ -132,8 +137,15 @@ class ProbedStep(NamedTuple):
             elapsed = elapsed + h
             magnitude = jtu.tree_map(lambda d, x: x + h / elapsed * (d - x), now, probe.magnitude)
         ends = jtu.tree_map(lambda a, b: jnp.maximum(jnp.abs(a), jnp.abs(b)), _integrated(held), _integrated(y1))
-        errors = jnp.where(probe.counts > 0, self._size((t0, t1), error, error_of_probe, magnitude, ends), 0.0)
-        after = ProbeTangent(tangent, magnitude, elapsed, jnp.ones_like(probe.counts))
+        late = jnp.maximum(h, _LATE * probe.length)
+
+        def scale(magnitude: Array, now: Array, before: Array) -> Array:
+            begins = before < _OF_ARRAY * now
+            return jnp.where(begins, jnp.maximum(magnitude, now * (_SOON * late / h)), magnitude)
+
+        scales = jtu.tree_map(scale, magnitude, now, probe.magnitude)
+        errors = jnp.where(probe.counts > 0, self._size((t0, t1), error, error_of_probe, scales, ends), 0.0)
+        after = ProbeTangent(tangent, magnitude, elapsed, late, jnp.ones_like(probe.counts))
         return Probed(y1, after), (error, errors), dense, state1, result
 
     def _size(self, times: tuple[Array, Array], error: PyTree, of_probe: PyTree, magnitude: PyTree, y: PyTree) -> Array:

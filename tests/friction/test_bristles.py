@@ -14,7 +14,7 @@ import jaxmodsim as jms
 from jaxmodsim.friction import AbstractDynamicLaw, ArmstrongState
 from jaxmodsim.identify import law_force
 
-from ..helpers.differences import central_difference
+from ..helpers.differences import central_difference, gradient_by_differences
 
 
 def mass(t: Any, q: Any, qd: Any, p: Any) -> Any:
@@ -120,6 +120,20 @@ def test_armstrong_friction_lags_by_its_time_constant() -> None:
     force = jax.vmap(lambda t: law.force(jnp.array(fast), law.step_exact(jnp.array(fast), settled, t)))(t)
     levels = [1.0 + 0.5 / (1 + (v / 1e-2) ** 2) for v in (slow, fast)]
     np.testing.assert_allclose(force, levels[1] + (levels[0] - levels[1]) * np.exp(-t / 0.02), rtol=2e-3)
+
+
+def test_derivatives_of_armstrong_on_a_belt() -> None:
+    """Against differences of tight runs: the contact yields at a kink, up to which one state is zero."""
+
+    def end(x: Any, rtol: Any) -> Any:
+        Fs, tau, k = x
+        law = jms.Armstrong(sigma0=750.0, Fc=1.5, Fs=Fs, vs=0.2, Fv=0.1, tau=tau, gamma=2.0)
+        scene = jms.Scene(pulled, {"m": 2.0, "k": k, "v": 0.0}, (jms.Friction(law, belt_velocity=0.13),))
+        return jms.simulate(scene, [0.0], [0.05], 1.0, rtol=rtol).q[-1, 0]
+
+    x, run = jnp.array([1.75, 0.05, 30.0]), jax.jit(end)
+    wanted = gradient_by_differences(lambda x: run(x, 1e-11), x, 3e-3)
+    np.testing.assert_allclose(jax.jit(jax.grad(end))(x, 1e-6), wanted, rtol=1e-4)
 
 
 def test_the_limit_cycle_of_the_1995_set() -> None:

@@ -393,6 +393,12 @@ def test_wrong_options_are_refused(clean, options, text):
         jms.fit(sprung(), noisy(clean, 0), ("m",), **options)
 
 
+def test_a_law_without_derivatives_is_refused(clean):
+    scene = jms.Scene(sprung().lagrangian, sprung().params, (jms.Friction(jms.DeadZone(jms.Coulomb(1.0), 0.1)),))
+    with pytest.raises(ValueError, match=r"through friction 'friction' \(DeadZone\): its force jumps"):
+        jms.fit(scene, noisy(clean, 0), ("m",), q0=[0.0])
+
+
 def test_fit_law_refuses_noise_that_differs_between_records():
     t = np.linspace(0.0, 1.0, 51)
     motion, force = {"x": 1e-3 * np.sin(t)}, np.cos(t)

@@ -254,6 +254,40 @@ def test_a_run_that_ends_early_or_has_no_length() -> None:
     assert jax.grad(still)(jnp.asarray(2.0)) == jax.jacfwd(still)(jnp.asarray(2.0)) == 2.0
 
 
+@pytest.mark.parametrize("rise", [1e2, 1e6])
+@pytest.mark.parametrize("solver", ["Tsit5", "Rodas5P"])
+def test_a_number_that_is_zero_up_to_a_kink(solver: str, rise: float) -> None:
+    """x' = 1, s' = rise max(x - c, 0) (1 - s): all tangents of s begin at x = c, and 1 - s is a Gaussian bell."""
+
+    def field(_: Any, y: Any, p: Any) -> Any:
+        x, s = y
+        return jnp.ones_like(x), p["rise"] * jnp.maximum(x - p["c"], 0.0) * (1.0 - s)
+
+    def end(p: Any) -> Any:
+        solution = dfx.diffeqsolve(
+            dfx.ODETerm(field),
+            SOLVERS[solver],
+            0.0,
+            p["t1"],
+            0.01,
+            (jnp.zeros(()), jnp.zeros(())),
+            p,
+            stepsize_controller=dfx.PIDController(1e-6, 1e-9),
+            adjoint=StoredSteps(),
+            max_steps=300,
+        )
+        ys: Any = solution.ys
+        return ys[1][0]
+
+    def exact(p: Any) -> Any:
+        return 1.0 - jnp.exp(-0.5 * p["rise"] * (p["t1"] - p["c"]) ** 2)
+
+    p = jax.tree.map(jnp.asarray, {"rise": rise, "c": 1.0, "t1": 1.0 + rise**-0.5})
+    slopes, wanted = jax.jit(jax.grad(end))(p), jax.grad(exact)(p)
+    for name in p:
+        np.testing.assert_allclose(slopes[name], wanted[name], rtol=1e-5, err_msg=name)
+
+
 def test_events() -> None:
     """A ball that bounces three times; its height at the end and the time of the last bounce, against closed forms."""
     g, e, h, t1 = 9.81, 0.8, 1.0, 2.0

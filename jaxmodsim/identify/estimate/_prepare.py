@@ -116,6 +116,8 @@ def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str
     """Check everything, with the errors of `fit`, and build the problem."""
     if not isinstance(scene, Scene):
         raise ValueError(f"scene must be a Scene, but {scene!r} was given.")
+    if why := scene.without_derivatives:
+        raise ValueError(why)
     several = records_of(records)
     _check_inputs(scene, several)
     for _, module in modules_of(scene):
