@@ -61,9 +61,9 @@ with _probe(
     from jax.extend.core import Primitive as Primitive
     from jax.extend.core import jaxpr_as_fun as jaxpr_as_fun
 
-    _need(Jaxpr, "constvars eqns invars outvars")
+    _need(Jaxpr, "constvars eqns invars outvars replace")
     _need(ClosedJaxpr, "consts in_avals jaxpr")
-    _need(JaxprEqn, "effects invars outvars params primitive")
+    _need(JaxprEqn, "effects invars outvars params primitive replace")
     _need(Primitive, "bind get_bind_params multiple_results")
 
 with _probe("kernels", "single runs and their derivatives take several times as long on CPU"):

@@ -1,14 +1,16 @@
-"""Calls without the run-time checks by which a library validates its arguments."""
+"""Traced functions of diffrax without what costs time: checks of their arguments, and a hundred steps of rounding."""
 
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.core
+import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax import lax
 from jaxtyping import Array
 
-from .._core.compat import AVAILABLE, ClosedJaxpr, Literal
+from .._core.compat import AVAILABLE, ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 
 
 def without_error_checks(fn: Callable[..., Any], *args: Array | None) -> Any:
@@ -79,3 +81,32 @@ def _inner(eqn: Any) -> list[Any]:
     """Traced functions inside an equation: bodies, branches, and functions with a derivative of their own."""
     inside = [x for value in eqn.params.values() for x in (value if isinstance(value, tuple | list) else (value,))]
     return [getattr(x, "jaxpr", x) for x in inside if hasattr(getattr(x, "jaxpr", x), "eqns")]
+
+
+def without_single_roundings(jaxpr: Jaxpr) -> Jaxpr:
+    """The traced loop of diffrax, with the calls by which it steps back from t1, one rounding at a time, as one step.
+
+    It steps on to t1 from any time up to 100 roundings before. These calls were 394 of 2638 equations of LuGre's box,
+    and a sixth of the time in which it compiles.
+    """
+    if "jaxprs" not in AVAILABLE:
+        return jaxpr
+    calls: list[JaxprEqn] = []
+    for eqn in jaxpr.eqns:
+        if any(x.primitive.name == "nextafter" for function in _inner(eqn) for x in function.eqns):
+            calls = [*calls, eqn] if calls and eqn.invars == calls[-1].outvars else [eqn]
+    if len(calls) < 3:
+        return jaxpr
+    # The first one stays: before zero it is the largest negative number that is not subnormal.
+    first, *others = calls
+    step = jax.jit(lambda t: _before(t, len(others)))
+    (one,) = jax.make_jaxpr(step)(first.outvars[0].aval).jaxpr.eqns
+    one = one.replace(invars=first.outvars, outvars=others[-1].outvars)
+    kept = [one if eqn is others[-1] else eqn for eqn in jaxpr.eqns if not any(eqn is x for x in others[:-1])]
+    return jaxpr.replace(eqns=kept)
+
+
+def _before(t: Array, roundings: int) -> Array:
+    """The number so many roundings before `t`, which is not within them from zero: the bits of numbers are in order."""
+    bits = lax.bitcast_convert_type(t, jnp.dtype(f"int{8 * t.dtype.itemsize}"))
+    return lax.bitcast_convert_type(bits + jnp.where(t > 0, -roundings, roundings).astype(bits.dtype), t.dtype)

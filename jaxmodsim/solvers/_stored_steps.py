@@ -14,6 +14,7 @@ from jaxtyping import Array, PyTree
 from .._core.arrays import Fn
 from .._core.compat import AVAILABLE, Primitive, UndefinedPrimal, diffrax_loop, eqxi, lax_loop
 from ._controllers import FiniteSteps
+from ._error_checks import without_single_roundings
 from ._over_steps import (
     ForwardOverSteps,
     RecordedRun,
@@ -159,8 +160,7 @@ class StoredSteps(dfx.AbstractAdjoint):
             self.probe and has_error_control(stepsize_controller),
             self.brief,
         )
-        run = eqx.filter_closure_convert(lambda inputs: _solve(inputs, fixed, None), inputs)
-        return eqxi.filter_primitive_bind(_run_p, run, inputs, fixed, False)
+        return eqxi.filter_primitive_bind(_run_p, _traced_run(inputs, fixed, None), inputs, fixed, False)
 
 
 class _Fixed(NamedTuple):
@@ -240,6 +240,12 @@ def _traced_once(fn: Callable[..., PyTree], *args: PyTree) -> Callable[..., PyTr
     """`fn`, traced at `args`, as a pytree of its closure; its program is one equation in the programs that call it."""
     numbers, program = eqx.partition(eqx.filter_closure_convert(fn, *args), eqx.is_array)
     return eqx.Partial(eqx.filter_jit(lambda numbers, *args: eqx.combine(numbers, program)(*args)), numbers)
+
+
+def _traced_run(inputs: StepInputs, fixed: _Fixed, by: StepInputs | None) -> Fn:
+    """`_solve`, traced at `inputs`, as a pytree of its closure."""
+    run: Any = eqx.filter_closure_convert(lambda inputs: _solve(inputs, fixed, by), inputs)
+    return eqx.tree_at(lambda run: run.jaxpr, run, without_single_roundings(run.jaxpr))
 
 
 def _solve(inputs: StepInputs, fixed: _Fixed, by: StepInputs | None) -> PyTree:
@@ -357,7 +363,7 @@ def _make_jvp(primals: PyTree, tangents: PyTree) -> PyTree:
     (run, inputs, fixed, keeps), by = primals, tangents[1]
     if not keeps:
         asked = jtu.tree_map(lambda _: True, by)
-        run = eqx.filter_closure_convert(lambda inputs: _solve(inputs, fixed, asked), inputs)
+        run = _traced_run(inputs, fixed, asked)
     final, steps = eqxi.filter_primitive_bind(_run_p, run, inputs, fixed, True)
     if jtu.tree_leaves(by):
         # Under vmap this gives each input a batch if the run has one, which the transpose needs.

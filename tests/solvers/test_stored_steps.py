@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from jaxmodsim import EventController, EventSolver, Gauss, Rodas5P, StoredSteps
+from jaxmodsim._core.compat import eqxi
+from jaxmodsim.solvers._error_checks import without_single_roundings
 
 # Over the steps of the plain run, which are those of `ForwardMode`.
 SAME_STEPS = StoredSteps(probe=False)
@@ -221,6 +223,22 @@ def test_vmap_and_float32() -> None:
     for name, x in single.items():
         assert x.dtype == jnp.float32
         np.testing.assert_allclose(x, together[name][-1], rtol=2e-4)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_a_hundred_roundings_in_one_step(dtype: Any) -> None:
+    """Before any time, zero and those next to a power of two among them, as by the calls of diffrax."""
+
+    def floor(t: Any) -> Any:
+        for _ in range(100):
+            t = eqxi.prevbefore(t)
+        return t
+
+    t = jnp.asarray([1.0, 1.0 + 50 * jnp.finfo(dtype).eps, 3.7, -2.5, 0.0, 1e-30, -1e-30, 1e5, jnp.inf], dtype)
+    short = without_single_roundings(jax.make_jaxpr(floor)(t[0]).jaxpr)
+    assert len(short.eqns) == 2
+    found = jax.vmap(lambda t: jax.core.eval_jaxpr(short, [], t)[0])(t)
+    np.testing.assert_array_equal(found, jax.vmap(floor)(t))
 
 
 def test_a_run_that_ends_early_or_has_no_length() -> None:
