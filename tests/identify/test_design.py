@@ -19,7 +19,7 @@ from jaxmodsim.identify import (
     e_optimal,
 )
 from jaxmodsim.identify.design import _design_input
-from jaxmodsim.identify.design._design_input import _axis, _coarse_share, _judge, _known, _Task
+from jaxmodsim.identify.design._design_input import _axis, _judge, _known, _share, _Task
 from jaxmodsim.identify.design._input_design import driven_motion, feed_forward, motion_basis, sensitivities
 from jaxmodsim.identify.model._axis import AxisEstimate
 from jaxmodsim.plot import design_figure
@@ -158,7 +158,7 @@ def test_gradients_of_goals_and_limits_equal_finite_differences():
     x = 3e-3 * np.random.default_rng(0).standard_normal(4)
     _, slope, peaks, rows = (np.asarray(each) for each in _judge(task, jnp.asarray(x)))
     # The smooth maximum lies above the largest share, by no more than the logarithm of all samples.
-    share = float(_coarse_share(task, jnp.asarray(x)))
+    share = float(_share(task, jnp.asarray(x)))
     assert share <= peaks[:3].max() <= share + np.log(2 * t.size) / 100.0
     for i in range(4):
         step = 1e-7 * np.eye(4)[i]  # of weights of 3 mm: truncation 1e-9, rounding 1e-8 of the derivative

@@ -27,7 +27,6 @@ from ._input_design import (
     driven_motion,
     feed_forward,
     motion_basis,
-    relative_numbers,
     sensitivities,
 )
 
@@ -178,23 +177,15 @@ def design_input(
         shapes, rates = motion_basis(t, harmonics)
         # None is a limit of infinity.
         inverse = [1.0 / (limit or np.inf) / (1.0 - _MARGIN) for limit in (limits.force, limits.speed, limits.travel)]
-        numbers = {
-            "t": t,
-            "shapes": shapes,
-            "rates": rates,
-            "inverse": inverse,
-            "weight": samples / count,
-            "prior": prior_information,
-            "uncertainty": uncertainty,
-        }
-        return _Task(axis=axis, criterion=criterion, **{name: jnp.asarray(x, float) for name, x in numbers.items()})
+        numbers = (t, shapes, rates, inverse, samples / count, prior_information, uncertainty)
+        return _Task(axis, *(jnp.asarray(x, float) for x in numbers), criterion)
 
     fine, coarse = task(samples), task((samples - 1) // stride + 1)
-    sines = [_fill(_coarse_share, coarse, column) for column in np.eye(2 * harmonics)[:harmonics]]
+    sines = [_fill(coarse, column) for column in np.eye(2 * harmonics)[:harmonics]]
     baseline = max(sines, key=lambda x: float(_judge(coarse, jnp.asarray(x, float))[0]))
     with reported(progress, "next input", lambda number, value: f"iteration {number}: criterion {value:.4g}") as report:
         best, ending = _improve(coarse, sines, baseline, seed, max_steps, report)
-    designed, sine = (_excitation(fine, _fill(_fine_share, fine, x), parameters.names, scale) for x in (best, baseline))
+    designed, sine = (_excitation(fine, _fill(fine, x, (1, 4)), parameters.names, scale) for x in (best, baseline))
     units = {name: allowed.unit for name, allowed in split_ranges(scene_numbers(scene), scene_ranges(scene)).items()}
     return InputDesign(
         best=designed,
@@ -257,8 +248,13 @@ def _axis(
     whole = scene_numbers(scene)
     numbers, ranges = split_entries(whole), split_ranges(whole, scene_ranges(scene))
     parameters = FreeParameters.of(numbers, ranges, chosen_entries(whole, free))
-    start = dict(parameters.start)
-    scale, slopes = relative_numbers({k: float(x) for k, x in start.items()}, parameters.following, parameters.names)
+    start, names = dict(parameters.start), parameters.names
+    # The unit of a free number is the number itself, so that errors are relative; 1 for a number that is zero.
+    scale = np.array([abs(float(start[name])) or 1.0 for name in names])
+    slopes: dict[str, np.ndarray] = {}
+    # Limits come before what they limit. A fixed number that is limited by a free one moves with it, as in a fit.
+    for name in start:
+        slopes[name] = scale * (np.array(names) == name) if name in names else slopes[parameters.following[name]]
     columns = {name: jnp.asarray(column, float) for name, column in slopes.items()}
     axis = DrivenAxis(scene, start, columns, position, jnp.asarray(noise, float), input_name, observe)
     still = jnp.full(3, position[0])
@@ -287,47 +283,38 @@ def _known(
 
 
 @eqx.filter_jit
-def _coarse_share(task: _Task, x: Float[Array, " weights"]) -> Float[Array, ""]:
-    """The largest share of a limit, by the reference and its force."""
-    return jnp.max(jnp.abs(task.shares(x, feed_forward(task.axis, task.t, *task.motion(x)))))
-
-
-@eqx.filter_jit
-def _fine_share(task: _Task, x: Float[Array, " weights"]) -> Float[Array, ""]:
-    """The largest share of a limit, also by runs of the model with one and four steps for every sample."""
+def _share(task: _Task, x: Float[Array, " weights"], runs: tuple[int, ...] = ()) -> Float[Array, ""]:
+    """The largest share of a limit, by the reference and its force; `runs`: steps for every sample in runs as well."""
     axis = task.axis
     force = feed_forward(axis, task.t, *task.motion(x))
     shares = [jnp.max(jnp.abs(task.shares(x, force)))]
-    for substeps in (1, 4):
+    for substeps in runs:
         q, qd = driven_motion(axis, task.t, force, substeps)
         shares += [task.inverse[1] * jnp.max(jnp.abs(qd)), task.inverse[2] * jnp.max(jnp.abs(q - axis.q0))]
     return jnp.max(jnp.stack(shares))
 
 
-def _fill(
-    share: Callable[[_Task, Array], Array], task: _Task, x: Float[np.ndarray, " weights"]
-) -> Float[np.ndarray, " weights"]:
-    """The motion scaled to the limits."""
+def _fill(task: _Task, x: Float[np.ndarray, " weights"], runs: tuple[int, ...] = ()) -> Float[np.ndarray, " weights"]:
+    """The motion scaled to the limits; `runs` as in `_share`."""
     x = np.asarray(x)
     kinematic = np.array([np.max(np.abs(task.rates @ x)), np.max(np.abs(task.shapes @ x))])
     largest = np.max(kinematic * np.asarray(task.inverse[1:]))
     x = x / largest if largest > 0 else _FAR * x / kinematic[1]
 
-    def fits(factor: float) -> bool:
-        return bool(share(task, jnp.asarray(factor * x, float)) <= 1.0)
+    def share(factor: float) -> float:
+        return float(_share(task, jnp.asarray(factor * x, float), runs))
 
     low = high = 1.0
-    while not fits(low):
+    while not share(low) <= 1.0:
         low, high = _SHRINK * low, low
         if low < _VANISHED:
-            needed = 100.0 * float(share(task, jnp.asarray(low * x, float)))
             raise ValueError(
-                f"No motion keeps the limits: the axis at rest takes {needed:.0f} % of one. Raise the limit of force,"
-                " or remove the constant load from the axis."
+                f"No motion keeps the limits: the axis at rest takes {100.0 * share(low):.0f} % of one. Raise the"
+                " limit of force, or remove the constant load from the axis."
             )
     while high > (1.0 + _FILLED) * low:
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if fits(middle) else (low, middle)
+        low, high = (middle, high) if share(middle) <= 1.0 else (low, middle)
     return low * x
 
 
@@ -381,12 +368,12 @@ def _improve(
     # Weights in units of the largest sine of their frequency.
     lengths = np.tile([float(np.max(np.abs(x))) for x in sines], 2)
     rng = np.random.default_rng(seed)
-    candidates = [_fill(_coarse_share, task, lengths * rng.standard_normal(lengths.size)) for _ in range(_TRIED)]
+    candidates = [_fill(task, lengths * rng.standard_normal(lengths.size)) for _ in range(_TRIED)]
     candidates.sort(key=lambda x: -_merit(task, x))
     best, best_merit, ending, count = baseline, _merit(task, baseline), "converged", 0
     for start in candidates[:_IMPROVED]:
         weights, how, count = _climb(task, start, lengths, max_steps, progress, count)
-        filled = _fill(_coarse_share, task, weights)
+        filled = _fill(task, weights)
         merit = _merit(task, filled)
         if merit > best_merit:
             best, best_merit, ending = filled, merit, how

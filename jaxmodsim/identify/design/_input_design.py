@@ -1,6 +1,6 @@
 """The best input for an axis: criteria, limits, the motion with its force, and the information of its record."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -360,18 +360,3 @@ def sensitivities(
     size = next(iter(axis.slopes.values())).shape[0]
     zero, units = jnp.zeros(size, force.dtype), jnp.eye(size, dtype=force.dtype)
     return jax.vmap(lambda unit: jax.jvp(record, (zero,), (unit,)), out_axes=(None, 1))(units)
-
-
-def relative_numbers(
-    values: Mapping[str, float], followed: Mapping[str, str], free: tuple[str, ...]
-) -> tuple[Float[np.ndarray, " free"], dict[str, np.ndarray]]:
-    """Units of the free numbers, and derivatives of all moving numbers by the free ones in these units.
-
-    The unit is the number itself, so that errors are relative; 1 for a number that is zero. A fixed number that is
-    limited by a free one moves with its limit, as in a fit.
-    """
-    scale = np.array([abs(values[name]) or 1.0 for name in free])
-    slopes: dict[str, np.ndarray] = {}
-    for name in values:  # limits come before what they limit
-        slopes[name] = scale * (np.array(free) == name) if name in free else slopes[followed[name]]
-    return scale, slopes

@@ -4,6 +4,7 @@ import abc
 import threading
 from collections.abc import Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any, TypeAlias
 
 import equinox as eqx
@@ -26,6 +27,16 @@ _GROUP = 32
 _BETTER = 1e-3
 # Rounds of several starts: share of the evaluations, and share of the starts kept after it.
 _ROUNDS = ((0.25, 0.25), (0.25, 0.125), (1.0, 0.0))
+
+
+def _whole(name: str, default: int) -> Any:
+    """A field for a positive integer."""
+    return eqx.field(static=True, default=default, converter=partial(as_whole, name=name))
+
+
+def _factor(name: str, default: float) -> Any:
+    """A field for a number above one."""
+    return eqx.field(static=True, default=default, converter=partial(as_float, name=name, lower=1.0))
 
 
 class AbstractInitializer(eqx.Module):
@@ -77,16 +88,10 @@ class MultiStart(AbstractInitializer):
     - `ValueError` for a number out of range.
     """
 
-    count: int = eqx.field(static=True, default=64)
-    spread: float = eqx.field(static=True, default=10.0)
-    steps: int = eqx.field(static=True, default=30)
+    count: int = _whole("MultiStart count", 64)
+    spread: float = _factor("MultiStart spread", 10.0)
+    steps: int = _whole("MultiStart steps", 30)
     seed: int = eqx.field(static=True, default=0)
-
-    def __check_init__(self) -> None:
-        """Refuse numbers out of range."""
-        as_whole(self.count, name="MultiStart count")
-        as_whole(self.steps, name="MultiStart steps")
-        as_float(self.spread, name="MultiStart spread", lower=1.0)
 
     def starts(self, problem: FitProblem, x: Float[Array, " n"]) -> Float[np.ndarray, "count n"]:
         """The starts, the first one at `x`."""
@@ -198,13 +203,8 @@ class Continuation(AbstractInitializer):
     """
 
     name: str = eqx.field(static=True)
-    factor: float = eqx.field(static=True, default=100.0)
-    stages: int = eqx.field(static=True, default=3)
-
-    def __check_init__(self) -> None:
-        """Refuse numbers out of range."""
-        as_whole(self.stages, name="Continuation stages")
-        as_float(self.factor, name="Continuation factor", lower=1.0)
+    factor: float = _factor("Continuation factor", 100.0)
+    stages: int = _whole("Continuation stages", 3)
 
     def initialize(self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> Initialized:
         """The end of the last fit before the actual one."""
@@ -267,16 +267,14 @@ class Stochastic(AbstractInitializer):
     """
 
     optimiser: Hashable = eqx.field(static=True)
-    batch: int = eqx.field(static=True, default=4)
-    steps: int = eqx.field(static=True, default=200)
+    batch: int = _whole("Stochastic batch", 4)
+    steps: int = _whole("Stochastic steps", 200)
     seed: int = eqx.field(static=True, default=0)
 
     def __check_init__(self) -> None:
-        """Refuse other objects than optimisers, and numbers out of range."""
+        """Refuse other objects than optimisers."""
         if not (hasattr(self.optimiser, "init") and hasattr(self.optimiser, "update")):
             raise ValueError(f"optimiser must be one of optax, as optax.adam(0.05), but it is {self.optimiser!r}.")
-        as_whole(self.batch, name="Stochastic batch")
-        as_whole(self.steps, name="Stochastic steps")
 
     def initialize(self, problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) -> Initialized:
         """The end of the last step; Ctrl-C ends at the previous step."""

@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..._core.arguments import as_float
 from ..._core.arrays import on_device
-from ..._core.parameters import Number, check_ranges, parameter
+from ..._core.parameters import AbstractRanged, Number, parameter
 from ...scene import State, replace_numbers, scene_numbers
 from ..data._record import Runs, slip_channel
 from ..model._engines import ModelOutput
@@ -31,7 +31,7 @@ _Rows = TypeVar("_Rows", Array, np.ndarray)
 _HELD = 1e6
 
 
-class AbstractLoss(eqx.Module):
+class AbstractLoss(AbstractRanged):
     """Loss of a residual in units of its noise level, as a function of its square: `rho(s)`, rho = s for small s."""
 
     robust: AbstractClassVar[bool]
@@ -85,10 +85,6 @@ class Huber(AbstractLoss):
     limit: Number = parameter("limit", "1", lower=0.0, strict=True, default=1.345)
     robust: ClassVar[bool] = True
 
-    def __check_init__(self) -> None:
-        """Refuse a limit out of range."""
-        check_ranges(self)
-
     def rho(self, s: Float[Array, "..."]) -> Float[Array, "..."]:
         """The loss where the square of the residual is `s`."""
         inside = s <= self.limit**2
@@ -109,10 +105,6 @@ class Cauchy(AbstractLoss):
 
     limit: Number = parameter("limit", "1", lower=0.0, strict=True, default=2.385)
     robust: ClassVar[bool] = True
-
-    def __check_init__(self) -> None:
-        """Refuse a limit out of range."""
-        check_ranges(self)
 
     def rho(self, s: Float[Array, "..."]) -> Float[Array, "..."]:
         """The loss where the square of the residual is `s`."""

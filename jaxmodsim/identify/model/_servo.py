@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.ndimage import gaussian_filter1d, percentile_filter
 
-from ..._core.parameters import Number, check_ranges, parameter
+from ..._core.parameters import AbstractRanged, Number, parameter
 from ...friction import ServoGear
 from ..data._record import SINGLE, Record, Runs
 from ._engines import ModelOutput, with_values
@@ -38,7 +38,7 @@ _GEAR_START = {
 }  # fmt: skip
 
 
-class Servo(eqx.Module):
+class Servo(AbstractRanged):
     """A servo whose gear turns a pendulum: `(inertia + armature) q'' = motor - gravity sin(q - tilt) - friction`.
 
     The motor torque is `kt (duty volts - kt q')/R` while the torque is enabled, and zero otherwise. The firmware sets
@@ -66,10 +66,6 @@ class Servo(eqx.Module):
     armature: Number = parameter("armature", "kg m^2", lower=0.0, default=0.002)
     tilt: Number = parameter("tilt", "rad", default=0.02)
     Kq: Number = parameter("Kq", "1/(N m)", lower=0.0, default=0.0)
-
-    def __check_init__(self) -> None:
-        """Refuse numbers out of range."""
-        check_ranges(self)
 
     @classmethod
     def start(cls, law: str, inertia: float, gravity: float) -> "Servo":
