@@ -225,23 +225,13 @@ class FitRequest(AbstractServoColumns):
 
 
 def check_exists(path: Path) -> None:
-    """Refuse a path without a file or folder.
-
-    **Raises:**
-
-    - `ValueError` naming it.
-    """
+    """Refuse a path without a file or folder."""
     if not path.exists():
         raise ValueError(f"There is no file {path}.")
 
 
 def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
-    """Refuse outputs that would replace an input, or one another.
-
-    **Raises:**
-
-    - `ValueError` naming the file.
-    """
+    """Refuse outputs that would replace an input, or one another."""
     taken = dict.fromkeys((path.resolve() for path in inputs), "a file that is read")
     for path in outputs:
         if other := taken.get(path.resolve()):
@@ -250,12 +240,7 @@ def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
 
 
 def check_axis(request: FitRequest) -> None:
-    """Check that options of one kind of axis are not given for the other.
-
-    **Raises:**
-
-    - `ValueError` naming an option without meaning for the axis, or an unknown axis.
-    """
+    """Refuse an unknown kind of axis, and options of the other kind."""
     if request.axis not in ("driven", "servo"):
         raise ValueError(f"--axis must be driven or servo, but {request.axis!r} was given.")
     for each in fields(request):

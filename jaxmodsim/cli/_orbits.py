@@ -11,12 +11,7 @@ from ._spec import read_orbit_spec
 
 
 def run_orbit(spec: Path, out: Path) -> None:
-    """Find the orbit of the SPEC, print it, and write its figure and its numbers.
-
-    **Raises:**
-
-    - `ValueError` as `read_orbit_spec` and `periodic_orbit`; `OrbitError` if there is no orbit.
-    """
+    """Find the orbit of the SPEC, print it, and write its figure and its numbers."""
     problem = read_orbit_spec(spec)
     orbit = periodic_orbit(problem.scene, problem.guess, **problem.options)
     say(str(orbit))
@@ -27,12 +22,7 @@ def run_orbit(spec: Path, out: Path) -> None:
 
 
 def run_branch(spec: Path, out: Path) -> None:
-    """Continue the branch of the SPEC, print its bifurcations, and write its figure and a table.
-
-    **Raises:**
-
-    - `ValueError` as `read_orbit_spec` and `continue_orbits`; `OrbitError` without a first orbit or a Hopf point.
-    """
+    """Continue the branch of the SPEC, print its bifurcations, and write its figure and a table."""
     problem = read_orbit_spec(spec)
     if problem.branch is None:
         raise ValueError(f'{spec.name}: the table [branch] is missing, as in parameter = "W", from = 0.2, to = 1.2.')
@@ -52,5 +42,4 @@ def run_branch(spec: Path, out: Path) -> None:
     say(str(branch))
     table = pd.DataFrame({branch.parameter: branch.values, "period [s]": branch.period, "stable": branch.stable})
     table[[f"amplitude[{i}]" for i in range(branch.amplitude.shape[1])]] = branch.amplitude
-    paths = write(out, {"branch.png": branch_figure(branch, beside=beside), "branch.csv": table})
-    show_paths([*paths, store])
+    show_paths([*write(out, {"branch.png": branch_figure(branch, beside=beside), "branch.csv": table}), store])

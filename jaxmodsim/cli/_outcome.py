@@ -24,7 +24,6 @@ from ..identify import (
     warnings_for,
 )
 from ..scene import Scene, scene_numbers
-from ._output import frame_of
 from ._plan import FitPlan
 
 # Units of numbers that declare none: the params of an axis, and initial states.
@@ -106,11 +105,6 @@ class FitOutcome:
             if name not in self.result.values and name != "u" and not name.endswith("belt_velocity")
         }
 
-    @property
-    def differences(self) -> tuple[str, ...]:
-        """Sentences on the parameters in which the records differ."""
-        return () if self.agreement is None else self.agreement.sentences
-
     def equations(self) -> tuple[str, ...]:
         """The equation of motion of the axis, then the force of each friction element, as text."""
         elements = list(self.scene.friction.values())
@@ -141,7 +135,7 @@ class FitOutcome:
         )
         warnings = (
             *self.plan.notes,
-            *self.differences,
+            *(self.agreement.sentences if self.agreement else ()),
             *(warning for each in self.scores for warning in each.warnings),
             *warnings_for(result),
         )
@@ -170,7 +164,8 @@ class FitOutcome:
 
     def summary(self) -> dict[str, object]:
         """Everything but the samples, as JSON knows it."""
-        agreed = None if self.agreement is None else jsonable(agreement_table(self.agreement).to_dict("records"))
+        columns = ("parameter", "common", "standard error", "between records", "95 % from", "to", "p of no difference")
+        agreed = self.agreement and [dict(zip(columns, row, strict=True)) for row in self.agreement.rows()]
         return {
             "headline": list(self.headline()),
             "read": list(self.plan.notes),
@@ -186,7 +181,7 @@ class FitOutcome:
             "expected": None if self.expected is None else self.expected.total,
             "expected_if_unchanged": None if self.expected is None else self.expected.unchanged,
             "held_out_within_band": {each.score.record.name: each.shares for each in self.predictions},
-            "agreement": agreed,
+            "agreement": jsonable(agreed),
             "differing": None if self.agreement is None else list(self.agreement.differing),
             "comparison": None if self.comparison is None else self.comparison.to_dict(),
             "substeps": self.substeps,
@@ -202,12 +197,6 @@ def with_units(result: FitResult, rotary: bool) -> FitResult:
         for name, unit in result.estimate.units.items()
     }
     return replace(result, estimate=replace(result.estimate, units=units))
-
-
-def agreement_table(agreement: RecordAgreement) -> pd.DataFrame:
-    """The common value of each parameter and its variation between records."""
-    columns = ("parameter", "common", "standard error", "between records", "95 % from", "to", "p of no difference")
-    return frame_of(agreement.rows(), *columns)
 
 
 def record_table(outcome: FitOutcome) -> pd.DataFrame:

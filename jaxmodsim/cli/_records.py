@@ -96,14 +96,12 @@ def read_record(path: Path, columns: AxisColumns, name: str | None = None) -> Ax
     """
     table, name = read_columns(path), name or path.stem
     try:
-        parts, rotary, notes = _parts_of(table, columns, name)
+        return _axis_record(table, columns, name)
     except ValueError as error:
         raise ValueError(f"{path.name}: {error}") from error
-    return AxisRecord(parts, rotary, tuple(f"{name}: {note}" for note in notes))
 
 
-def _parts_of(table: Columns, columns: AxisColumns, name: str) -> tuple[tuple[Record, ...], bool | None, list[str]]:
-    """The parts of the record, whether the axis is rotary, and sentences on reading it."""
+def _axis_record(table: Columns, columns: AxisColumns, name: str) -> AxisRecord:
     notes: list[str] = []
     if any(isinstance(column, Channel) for column in table.values()):
         table, notes = _on_one_clock(table, columns)
@@ -129,7 +127,8 @@ def _parts_of(table: Columns, columns: AxisColumns, name: str) -> tuple[tuple[Re
         )
     record = Record(t, position, {"u": force}, name=name)
     parts, gaps = _parts(record)
-    return parts, rotary, [*notes, *gaps, *_doubts(record, headers, units, rotary)]
+    notes += [*gaps, *_doubts(record, headers, units, rotary)]
+    return AxisRecord(parts, rotary, tuple(f"{name}: {note}" for note in notes))
 
 
 def offset_note(record: Record, force: str) -> tuple[str, ...]:

@@ -23,12 +23,7 @@ _GAIN_IN_NAME = re.compile(r"kp[_=]?(\d+(?:\.\d+)?)", re.IGNORECASE)
 
 
 def run_servo_fit(request: FitRequest) -> None:
-    """Fit one or several gear laws, rank them by the records left out, print and write the results.
-
-    **Raises:**
-
-    - `ValueError` for a wrong option, a missing column, or records that do not fit together.
-    """
+    """Fit one or several gear laws, rank them by the records left out, print and write the results."""
     laws, prior = _laws(request.laws), _prior(request.prior)
     mass, length = _pendulum(request.pendulum)
     records = tuple(read_servo(path, request)[0] for path in request.records)
@@ -68,12 +63,7 @@ def run_servo_fit(request: FitRequest) -> None:
 
 
 def run_servo_prediction(request: PredictRequest) -> None:
-    """Predict records, print and write the results.
-
-    **Raises:**
-
-    - `ValueError` for a file that is no fit of a servo, and as `read_servo`.
-    """
+    """Predict records, print and write the results."""
     fit, files, rows = ServoFit.load(request.fit), {}, []
     for path in request.records:
         record, measured = read_servo(path, request)

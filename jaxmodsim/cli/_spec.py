@@ -1,4 +1,7 @@
-"""The SPEC of `jaxmodsim sweep`, `orbit`, `branch` and `export`: a TOML file, read into arguments of the library."""
+"""The SPEC of `jaxmodsim sweep`, `orbit`, `branch` and `export`: a TOML file, read into arguments of the library.
+
+A mistake raises a `ValueError` of one sentence with the table and the key.
+"""
 
 import math
 from collections.abc import Callable
@@ -172,12 +175,7 @@ class Reduced:
 
 
 def read_sweep_spec(path: Path) -> SweepSpec:
-    """Read the SPEC of a sweep. Names of numbers and observables are checked by `sweep`.
-
-    **Raises:**
-
-    - `ValueError` for a mistake, as one sentence with the table and the key.
-    """
+    """Read the SPEC of a sweep. Names of numbers and observables are checked by `sweep`."""
     name = path.name
     whole = _toml.read_table(_SweepTables, _toml.read_toml(path), name)
     arguments = _toml.read_table(_RunTable, whole.run, where := _toml.inner(name, "run")).model_dump(exclude_none=True)
@@ -255,12 +253,7 @@ def _observe(content: dict[str, object], where: str, series: bool) -> dict[str, 
 
 
 def read_orbit_spec(path: Path) -> OrbitSpec:
-    """Read the SPEC of an orbit or a branch.
-
-    **Raises:**
-
-    - `ValueError` for a mistake, as one sentence with the table and the key.
-    """
+    """Read the SPEC of an orbit or a branch."""
     name = path.name
     whole = _toml.read_table(_OrbitTables, _toml.read_toml(path), name)
     scene, where = _scene(whole.scene, path), _toml.inner(name, "orbit")
@@ -290,12 +283,7 @@ def read_orbit_spec(path: Path) -> OrbitSpec:
 
 
 def read_export_spec(path: Path) -> tuple[Scene, dict[str, Any]]:
-    """Read the SPEC of an FMU: the scene, and the other arguments of `export.fmu`, by name.
-
-    **Raises:**
-
-    - `ValueError` for a mistake, as one sentence with the table and the key.
-    """
+    """Read the SPEC of an FMU: the scene, and the other arguments of `export.fmu`, by name."""
     whole = _toml.read_table(_ExportTables, _toml.read_toml(path), path.name)
     scene = _scene(whole.scene, path)
     table = _toml.read_table(_ExportTable, whole.export, _toml.inner(path.name, "export"))
