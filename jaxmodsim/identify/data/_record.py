@@ -2,27 +2,18 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
-from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
+from typing import NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 from jaxtyping import Array, ArrayLike, Float
 
 from ..._core.arguments import as_float, as_label, as_mapping, as_names, as_reals
 from ..._core.arrays import on_device
 
-
-@runtime_checkable
-class TableColumn(Protocol):
-    """A column of a table (pandas, xarray, polars) that NumPy can convert."""
-
-    def __array__(self, *arguments: object, **options: object) -> np.ndarray:
-        """As an array."""
-        ...
-
-
-# Samples of one channel, shape `[samples]`.
-Column: TypeAlias = ArrayLike | Sequence[object] | TableColumn
+# Samples of one channel, shape `[samples]`; also a column of a table (pandas, xarray, polars).
+Column: TypeAlias = ArrayLike | Sequence[object] | npt.ArrayLike
 # Default name of a single channel.
 SINGLE = "measured"
 

@@ -297,7 +297,7 @@ def motion_basis(
 def feed_forward(
     axis: DrivenAxis, t: Float[Array, " time"], q: Float[Array, " time"], qd: Float[Array, " time"]
 ) -> Float[Array, " time"]:
-    """Force, held from each sample to the next, for a motion of the axis; the last one is not used.
+    """Force [N], held from each sample to the next, for a motion of the axis; the last one is not used.
 
     Inverse dynamics: the state of the friction follows from the motion alone. The force over a sample gives the change
     of velocity over it, by the acceleration in the middle, which is linear in the force.
@@ -306,10 +306,6 @@ def feed_forward(
 
     - `t`: times of the samples [s].
     - `q`, `qd`: motion at the samples [m], [m/s].
-
-    **Returns:**
-
-    The force at each sample [N].
     """
     scene = axis.scene
 

@@ -48,12 +48,7 @@ class AbstractInitializer(eqx.Module):
 
 
 def as_initializers(initializer: object) -> tuple[AbstractInitializer, ...]:
-    """One initializer or several, as a tuple.
-
-    **Raises:**
-
-    - `ValueError` for anything else.
-    """
+    """One initializer or several, as a tuple; anything else is refused."""
     several = (initializer,) if isinstance(initializer, AbstractInitializer) else initializer
     if not isinstance(several, tuple | list) or not all(isinstance(each, AbstractInitializer) for each in several):
         raise ValueError(
@@ -298,8 +293,7 @@ class Stochastic(AbstractInitializer):
                 update, state = optimiser.update(gradient, state, x)
                 x = jnp.clip(x + update, box.lower, box.upper)
                 if options.progress is not None:
-                    values = problem.free.values(problem.split(x)[0])
-                    shown = {name: float(values[name]) for name in problem.free.names}
+                    shown = dict(zip(problem.free.names, problem.at(x).vector.tolist(), strict=True))
                     options.progress(number + 1, float(jnp.sqrt(2 * cost)), shown)
         except KeyboardInterrupt:
             pass  # the fit continues from here

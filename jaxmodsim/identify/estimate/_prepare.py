@@ -28,11 +28,9 @@ from ._search import SearchResult, channels_seen
 
 # Factor of the integration steps that shows their error in the output.
 _FINER = 4
-
 # Standard deviation of the velocity at the start around that of the first samples, in its standard errors: large
 # enough that the samples, which are fitted as well, hardly count twice.
 _DOUBT = 4.0
-
 # Coordinates or velocities at the first sample, shape `[dof]` or `[records, dof]`.
 StartState: TypeAlias = ArrayLike | Sequence[ArrayLike] | Sequence[Sequence[ArrayLike]]
 
@@ -87,7 +85,6 @@ class FitOptions(eqx.Module):
     accuracy: float = eqx.field(default=1e-8, converter=partial(as_float, name="accuracy", lower=0.0))
 
     def __check_init__(self) -> None:
-        """Refuse objects of another kind."""
         for name, value, kind, words in (
             ("loss", self.loss, AbstractLoss, "a loss such as Huber()"),
             ("controller", self.controller, Controller | None, "a Controller"),
@@ -132,15 +129,14 @@ def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str
         local = tuple(name for name in own if linked or not name.startswith("z0"))
     unknown = _unknown(options, observables, own, local)
     numbers, ranges = _numbers(scene, several, options)
-    single = split_entries(numbers)
     whole = scene_numbers(scene)
     undriven = {name: x for name, x in whole.items() if name not in several[0].inputs}
     check_not_nan(undriven.values(), lambda: undriven)
-    chosen = shared if isinstance(shared, str) else chosen_entries({**whole, **numbers}, shared)
+    chosen = chosen_entries({**whole, **numbers}, shared)
     driven = sorted(set(chosen) & set(several[0].inputs))
     if driven:
         raise ValueError(f"{driven[0]} is driven by the record and cannot be free.")
-    parameters = FreeParameters.of(single, ranges, chosen, _passive(options.passive, numbers))
+    parameters = FreeParameters.of(numbers, ranges, chosen, _passive(options.passive, numbers))
     windows = cut(several, None if options.shooting is None else options.shooting.window)
     runs = runs_of(several, windows)
     base = _bases(scene, several, windows, states, observables)

@@ -218,8 +218,7 @@ def solve(problem: FitProblem, x: Float[Array, " n"], options: SearchOptions) ->
                     " take more substeps."
                 )
             if options.progress is not None:
-                values = problem.at(state.x).values
-                shown = {name: float(values[name]) for name in problem.free.names}
+                shown = dict(zip(problem.free.names, problem.at(state.x).vector.tolist(), strict=True))
                 options.progress(iteration, _rms(problem, state), shown)
             if int(state.done):
                 return SearchResult(problem, state, int(state.steps), continued(ENDINGS[int(state.done)], rounds, at))

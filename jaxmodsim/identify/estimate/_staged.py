@@ -70,8 +70,7 @@ class Staged(AbstractInitializer):
         values = {name: float(value) for name, value in problem.free.values(x[: len(units)]).items()}
         sizes = _sizes(problem, sampled, values)
         values |= {name: sizes[unit] for name, unit in units.items() if unit in sizes}
-        start = problem.free.coordinates(values)
-        balance, known = _fit_balance(problem, sampled, start, options)
+        balance, known = _fit_balance(problem, sampled, problem.free.coordinates(values), options)
         for name, value in balance.items():
             if known[name]:
                 size = sizes.get(units[name])
@@ -206,11 +205,8 @@ def _fit_balance(
             break
     size = jnp.sqrt(jnp.sum(state.jacobian**2, axis=0))
     shows = np.asarray(size > _SHOWS * jnp.max(size))
-    values = problem.free.values(state.x)
-    return (
-        {name: float(values[name]) for name in problem.free.names},
-        dict(zip(problem.free.names, (bool(x) for x in shows), strict=True)),
-    )
+    values, names = problem.free.values(state.x), problem.free.names
+    return {name: float(values[name]) for name in names}, dict(zip(names, shows.tolist(), strict=True))
 
 
 @eqx.filter_jit

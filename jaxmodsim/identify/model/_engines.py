@@ -209,16 +209,19 @@ def run_samples(
     """
     exact = bool(scene.mode_names)
 
-    def advance(carry: tuple[Any, PyTree], sample: tuple[Array, Array, PyTree, PyTree]) -> tuple[Any, PyTree]:
-        ((y, mode), memory), (start, dt, held, slopes) = carry, sample
-        here = driven(scene, held)
-        outputs: dict[str, Array] = {}
+    def look(t: Array, at: tuple[State, Any], memory: PyTree, held: Inputs) -> tuple[Scene, Any, PyTree, PyTree]:
+        """The scene with its inputs at a sample, state and modes, memory, and the observed quantities."""
+        (y, mode), here = at, driven(scene, held)
         if controller is not None:
-            outputs, memory = controller.fn(start, y.q, y.qd, memory, here.params)
+            outputs, memory = controller.fn(t, y.q, y.qd, memory, here.params)
             here = driven(here, outputs)
         if exact:
-            y, mode = settle(start, y, here, mode)
-        seen = observe(start, y, here, mode)
+            y, mode = settle(t, y, here, mode)
+        return here, (y, mode), memory, observe(t, y, here, mode)
+
+    def advance(carry: tuple[Any, PyTree], sample: tuple[Array, Array, PyTree, PyTree]) -> tuple[Any, PyTree]:
+        start, dt, held, slopes = sample
+        here, (y, mode), memory, seen = look(start, *carry, held)
 
         def scene_at(t: Array) -> Scene:
             return driven(here, {k: held[k] + (t - start) * x for k, x in slopes.items()})
@@ -244,13 +247,8 @@ def run_samples(
     memory = () if controller is None else controller.memory
     samples = (t[:-1], dt, jtu.tree_map(lambda x: x[:-1], inputs), slopes)
     begin = first_modes(t[0], y0, driven(scene, jtu.tree_map(lambda x: x[0], inputs))) if exact else (y0, None)
-    ((end, mode), memory), seen = jax.lax.scan(advance, (begin, memory), samples)
-    last = driven(scene, jtu.tree_map(lambda x: x[-1], inputs))
-    if controller is not None:
-        last = driven(last, controller.fn(t[-1], end.q, end.qd, memory, last.params)[0])
-    if exact:
-        end, mode = settle(t[-1], end, last, mode)
-    final = observe(t[-1], end, last, mode)
+    carry, seen = jax.lax.scan(advance, (begin, memory), samples)
+    _, (end, _), _, final = look(t[-1], *carry, jtu.tree_map(lambda x: x[-1], inputs))
     return jtu.tree_map(lambda x, y: jnp.concatenate([x, jnp.asarray(y)[None]]), seen, final), end
 
 

@@ -65,25 +65,22 @@ def check_observables(observables: Observables, scene: Scene, y: State) -> None:
       uses an index out of range.
     """
     for channel, observable in observables:
-        if not isinstance(observable, str) and not callable(observable):
-            raise ValueError(
-                f"observe must be a function of q and qd, or a name such as 'q[0]', but {channel} has {observable!r}."
-            )
         if isinstance(observable, str):
-            entry = _STATE.fullmatch(observable)
             known = [f"{x}[{i}]" for x in ("q", "qd") for i in range(y.q.shape[0])] + list(scene.names)
             if observable not in known:
-                hint = "" if entry else did_you_mean(observable, known)
+                hint = "" if _STATE.fullmatch(observable) else did_you_mean(observable, known)
                 raise ValueError(
                     f"observe: {channel} observes {observable!r}, but there are: {', '.join(known)}.{hint}"
                 )
-        if callable(observable):
-            value = traced(observable, name="observe(q, qd)", q=y.q, qd=y.qd)
-        else:
-            look = observer(((channel, observable),))
+            what, look = repr(observable), observer(((channel, observable),))
             value = jax.eval_shape(lambda look=look: look(jnp.zeros((), y.q.dtype), y, scene, None))[channel]
+        elif callable(observable):
+            what, value = "observe(q, qd)", traced(observable, name="observe(q, qd)", q=y.q, qd=y.qd)
+        else:
+            raise ValueError(
+                f"observe must be a function of q and qd, or a name such as 'q[0]', but {channel} has {observable!r}."
+            )
         if (shape := getattr(value, "shape", None)) != ():
-            what = "observe(q, qd)" if not isinstance(observable, str) else f"{observable!r}"
             raise ValueError(f"{what} returned the shape {shape}, but one number, shape (), is needed.")
 
 

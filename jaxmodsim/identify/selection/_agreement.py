@@ -342,8 +342,7 @@ def covariances(result: FitResult, variation: float, agreement: RecordAgreement 
         raise ValueError(f"variation must be finite and >= 0, such as 0.04 for 4 %, but it is {variation!r}.")
     search = result.search_for("A prediction")
     names, count = search.problem.free.names, len(result.provenance.records)
-    blocks = independent_blocks(search)
-    own = covariance_of(search.problem, search.state, range(len(names)), blocks).covariance
+    own = covariance_of(search.problem, search.state, range(len(names)), independent_blocks(search)).covariance
     known = np.isfinite(np.diag(own))
     own = np.where(np.outer(known, known), own, 0.0)
     level = np.array([result.values[name] * (name in friction_levels(result)) for name in names])

@@ -20,14 +20,14 @@ from ..data._record import Record, Runs, cut, runs_of
 from ..estimate._initializers import AbstractInitializer, Continuation, FromSmaller, as_initializers, last_part
 from ..estimate._prepare import FitOptions, StartState, initial_states, measured_start, prepare, prepare_law
 from ..estimate._problem import AbstractLoss, FitProblem
-from ..estimate._search import SearchOptions, SearchResult, SearchState, finished, solve
+from ..estimate._search import SearchOptions, SearchResult, SearchState, finished, solve, state_at
 from ..model._engines import DELAY
 from ..model._observe import Observable, by_channel, first_coordinate
 from ..model._parameters import split_entries
 from ..uncertainty._fit import fitted
 from ..uncertainty._result import FitResult
 from ._comparison import ENOUGH, Comparison, CrossValidated, Part, comparison_of
-from ._evaluation import after, begin, check_lengths, sample_counts, shown_starts
+from ._evaluation import begin, check_lengths, opening, sample_counts, shown_starts
 
 # Called after each iteration with the name of the model, the number of the held-out fold (None: the fit to everything),
 # the number of the iteration and the root mean square of the residual.
@@ -64,13 +64,17 @@ class CompareOptions:
     def fit_of(self, scene: Scene, **starts: StartState) -> FitOptions:
         """The options of a fit of this scene, with the limits of its numbers."""
         names = _names(scene, self.records)
-        limits = {name: each for name, each in self.fit.limits.items() if _limited(name) in names}
+        # The limit of friction.Fs/friction.Fc is one of friction.Fs.
+        limits = {name: each for name, each in self.fit.limits.items() if name.partition("/")[0] in names}
         return replace(self.fit, limits=limits, **starts)
 
     @property
     def windows(self) -> tuple[Record, ...]:
-        """All records cut into their windows."""
-        return tuple(each for record in self.records for each in record.windows(_span(record) / self.folds))
+        """All records cut into their windows, as many as there are folds each."""
+        spans = [float(record.t[-1] - record.t[0]) for record in self.records]
+        return tuple(
+            x for record, span in zip(self.records, spans, strict=True) for x in record.windows(span / self.folds)
+        )
 
 
 def compare(
@@ -181,15 +185,10 @@ def _check_scenes(models: Mapping[str, Candidate], options: CompareOptions) -> N
         known |= _names(scene, options.records)
         base = prepare(scene, options.records, candidate.free, options.fit_of(scene)).problem.base
         check_lengths(options.hold_out or options.windows, 0 if base is None else base.q.shape[1] + base.qd.shape[1])
-    unknown = [name for name in options.fit.limits if _limited(name) not in known]
+    unknown = [name for name in options.fit.limits if name.partition("/")[0] not in known]
     unknown += [each.name for each in options.initializers if isinstance(each, Continuation) and each.name not in known]
     if unknown:
         raise ValueError(f"{unknown[0]} is no number of any candidate; there are: {', '.join(sorted(known))}.")
-
-
-def _limited(name: str) -> str:
-    """The number that a limit is for: friction.Fs of "friction.Fs/friction.Fc"."""
-    return name.partition("/")[0]
 
 
 def _names(scene: Scene, records: tuple[Record, ...]) -> set[str]:
@@ -243,8 +242,7 @@ def _validated(
         block, x = _blocks(problem.runs, folds), _with_starts_of(problem, search)
         return CrossValidated(result, *_evaluated(problem, x, result, block, search_options(0)))
     else:
-        reached = _reached(search, options.records, folds)
-        problem = _with_own_starts(model, options.windows, reached, search, options)
+        problem = _with_own_starts(model, options.windows, _reached(search, options), search, options)
         block = np.broadcast_to(np.arange(problem.count)[:, None] % folds, problem.runs.t.shape)
         # Windows start as their first samples show. Free starts would take up errors of the model in the fitted
         # windows, and the parameters would then not fit a window whose start does not.
@@ -252,22 +250,12 @@ def _validated(
         pinned = problem.pinned(x, result.estimate.information)
         problem = shown_starts(problem, finished(begin(pinned, x, search_options(None))))
         x = finished(solve(problem, x, search_options(None))).state.x
-    parts = [_held_out(problem, x, result, block == k, block, search_options(k)) for k in range(folds)]
+    parts = []
+    for k in range(folds):
+        without = finished(solve(problem.counting(block != k), x, search_options(k))).state.x
+        parts.append(_evaluated(problem.counting(block == k), without, result, block, search_options(k)))
     held, start_fitted = zip(*parts, strict=True)
     return CrossValidated(result, sum(held, ()), sum(start_fitted, ()))
-
-
-def _held_out(
-    problem: FitProblem,
-    x: Float[Array, " n"],
-    result: FitResult,
-    mask: np.ndarray,
-    block: Int[np.ndarray, "runs samples"],
-    options: SearchOptions,
-) -> tuple[tuple[Part, ...], tuple[Part, ...]]:
-    """Fit from `x` without the samples in the mask, and evaluate these."""
-    x = finished(solve(problem.counting(~mask), x, options)).state.x
-    return _evaluated(problem.counting(mask), x, result, block, options)
 
 
 def _evaluated(
@@ -288,7 +276,8 @@ def _evaluated(
         return _parts(search.problem, search.state, block), ()
     shown = finished(begin(fixed, x, options)).state.x
     best = finished(solve(fixed, shown, options)).state.x
-    held, start_fitted = (_parts(*after(fixed, each), block) for each in (shown, best))
+    rest = fixed.counting(~opening(fixed.runs))
+    held, start_fitted = (_parts(rest, state_at(rest, each), block) for each in (shown, best))
     return held, start_fitted
 
 
@@ -311,10 +300,6 @@ def _blocks(runs: Runs, folds: int) -> Int[np.ndarray, "runs samples"]:
     return np.minimum(np.arange(runs.t.shape[1]) * folds // np.maximum(sample_counts(runs), 1), folds - 1)
 
 
-def _span(record: Record) -> float:
-    return float(record.t[-1] - record.t[0])
-
-
 def _with_starts_of(problem: FitProblem, search: SearchResult) -> Float[Array, " n"]:
     """The parameters of the search, and the starts of the problem."""
     size = len(problem.free.names)
@@ -333,13 +318,13 @@ def _with_own_starts(
     return eqx.tree_at(lambda p: (p.base, p.noise), replace(problem, known=known), (starts, noise))
 
 
-def _reached(search: SearchResult, records: tuple[Record, ...], folds: int) -> State:
+def _reached(search: SearchResult, options: CompareOptions) -> State:
     """States of the fit where windows begin, with a leading axis of windows."""
-    problem, x = search.problem, search.state.x
+    problem, x, records, folds = search.problem, search.state.x, options.records, options.folds
+    edges = np.cumsum(np.reshape([len(window.t) for window in options.windows], (-1, folds)), axis=1)[:, :-1]
     before = []
-    for i, record in enumerate(records):
-        edges = np.cumsum([len(window.t) for window in record.windows(_span(record) / folds)])[:-1]
-        before += [record.samples(0, int(edge) + 1, f"{i} {edge}") for edge in edges]
+    for i, (record, own) in enumerate(zip(records, edges.tolist(), strict=True)):
+        before += [record.samples(0, edge + 1, f"{i} {edge}") for edge in own]
     runs = runs_of(tuple(before), cut(tuple(before), None))
     first, ends = _ends(problem, x, on_device(np.repeat(np.arange(len(records)), folds - 1)), runs)
 

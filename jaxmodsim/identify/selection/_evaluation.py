@@ -17,7 +17,7 @@ from ..data._record import Record, Runs, cut, runs_of
 from ..data._signals import sample_noise
 from ..estimate._prepare import measured_start
 from ..estimate._problem import FitProblem, Prior, SquaredLoss
-from ..estimate._search import SearchOptions, SearchResult, SearchState, channels_seen, solve, state_at
+from ..estimate._search import SearchOptions, SearchResult, channels_seen, solve
 from ..model._engines import DELAY, EventEngine, ReplayEngine
 from ..model._parameters import FreeParameters
 from ..uncertainty._estimate import in_unit_columns
@@ -97,12 +97,6 @@ def start_errors_of(jacobian: Float[np.ndarray, "rows local"]) -> Float[np.ndarr
     scaled, size = in_unit_columns(jacobian)
     error = np.sqrt(np.diag(np.linalg.pinv(scaled.T @ scaled, rcond=1e-12, hermitian=True)))
     return np.where(np.any(jacobian, axis=0), error / size, np.inf)
-
-
-def after(problem: FitProblem, x: Float[Array, " n"]) -> tuple[FitProblem, SearchState]:
-    """The problem without the opening, and its residual at `x`."""
-    rest = problem.counting(~opening(problem.runs))
-    return rest, state_at(rest, x)
 
 
 @dataclass(frozen=True, kw_only=True)

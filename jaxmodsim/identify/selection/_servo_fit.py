@@ -256,8 +256,7 @@ def predict_servo(fit: ServoFit, record: Record) -> ServoPrediction:
 
     A `ServoPrediction`.
     """
-    runs = runs_of((record,), cut((record,), None))
-    run = jax.tree.map(lambda x: x[0], runs)
+    run = jax.tree.map(lambda x: x[0], runs_of((record,), cut((record,), None)))
     engine = jax.jit(lambda values: ServoEngine(fit.model)(values, None, run).channels[SINGLE])
     numbers = scene_numbers(fit.model)
     q = np.asarray(engine({name: numbers[name] for name in Servo.free(fit.law)}))

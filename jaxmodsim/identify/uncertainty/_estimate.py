@@ -20,21 +20,16 @@ from ..model._observe import RecordedMotion, motion_of
 # Blocks of samples: enough for the scatter of the scores of a dozen parameters, each much longer than the correlation
 # of the residual of a mechanism, which sensor steps in slow motion make long.
 BLOCKS = 16
-
 # Smallest eigenvalue of a scaled normal matrix, relative to the largest one, in units of rounding.
 ROUNDING = 10.0
-
 # A block of samples determines a direction alone if less than this share of its information is in other blocks.
 _ALONE = 0.01
-
 # An offset is reported beyond so many standard errors; share of a constant below which the parameters take it up.
 _BEYOND, _NO_PART = 4.0, 1e-8
-
 # Lags of tests for whiteness for a decade of samples, and samples for each lag at least. Probability below which a
 # residual is not white. Keeps divisions finite.
 _LAGS_A_DECADE, _SAMPLES_A_LAG = 10, 5
 _CHANCE, _TINY = 0.01, 1e-30
-
 # Derivatives are tested over this share of a standard error; their error must be below this share of the change.
 _TRIED, _HOLDS = 0.1, 0.5
 # Share of the largest information from which an axis is determined.
@@ -328,10 +323,6 @@ def interval(
 
     For a `logarithmic` parameter, which must stay above its lower limit, it is symmetric in the logarithm of the
     distance from it. For others it is cut at the limits, which are infinite for none.
-
-    **Raises:**
-
-    - `ValueError` unless 0 < level < 1.
     """
     level = as_share(level, name="level")
     low, high = limits
@@ -375,10 +366,10 @@ def natural_scales(problem: FitProblem, state: SearchState, entries: Sequence[in
     return np.where(moved > 0, np.sqrt(sum(scatter)) / np.where(moved > 0, moved, 1.0), 0.0)
 
 
-def offsets_left(
+def offset_issues(
     problem: FitProblem, state: SearchState, entries: Sequence[int], errors: Float[np.ndarray, " entries"]
-) -> dict[str, tuple[float, float]]:
-    """Constant offsets of channels, with standard errors, in the units of the channels.
+) -> tuple[IdentifiabilityIssue, ...]:
+    """Constant offsets of channels that the model lacks, as an offset of a sensor.
 
     One Gauss-Newton step with the offset as one more parameter. Only offsets far beyond their standard error that move
     a parameter by more than its own; none of a channel whose offset the start takes up.
@@ -387,12 +378,12 @@ def offsets_left(
 
     - `entries`: entries of x whose parameters count. `errors`: their standard errors.
     """
-    if problem.loss.robust:
-        return {}
+    if problem.loss.robust or problem.base is None or not np.isfinite(float(state.cost)):
+        return ()
     rows, residual = problem.samples, np.asarray(state.residual, float)
     scaled, size = in_unit_columns(np.asarray(state.jacobian, float))
     numbers, count = sample_blocks(problem)
-    offsets = {}
+    issues = []
     for channel in problem.runs.weight:
         column = np.concatenate([np.asarray(w) * (name == channel) for name, w in problem.columns.items()], axis=1)
         column = np.concatenate([column.reshape(-1), np.zeros(problem.rows - rows)])
@@ -410,10 +401,14 @@ def offsets_left(
         moved = problem.slopes_at(state.x) @ (offset * taken / size)
         far = np.abs(moved[list(entries)]) > errors
         if abs(offset) > _BEYOND * error and far.any():
-            # The model lacks the offset of the sensor.
             level = float(problem.noise[channel])
-            offsets[channel] = offset * level, error * level
-    return offsets
+            sentence = (
+                f"{channel} seems to have a constant offset of {offset * level:.3g} +- {error * level:.1g}: with it"
+                " parameters move by more than their standard errors, so their intervals do not hold. Subtract it from"
+                " the record and fit again."
+            )
+            issues.append(IdentifiabilityIssue(sentence, ()))
+    return tuple(issues)
 
 
 def derivatives_hold(problem: FitProblem, state: SearchState) -> bool:

@@ -28,7 +28,7 @@ from ._estimate import (
     ParameterEstimate,
     covariance_of,
     natural_scales,
-    offsets_left,
+    offset_issues,
 )
 from ._identifiability import identifiability_issues
 from ._result import FitResult, uncertain_of
@@ -271,7 +271,7 @@ def result_of(
         starts=starts,
         single_precision=jnp.result_type(float) == jnp.float32,
         issues=(
-            *_offset_issues(estimate, search, entries),
+            *offset_issues(problem, state, entries, np.array(list(estimate.errors.values()))),
             *_issues(estimate, provenance, search, covariance.refused),
         ),
     )
@@ -312,23 +312,6 @@ def _issues(
     free = search.problem.free.names
     issues = identifiability_issues(model, provenance.motions, dof, provenance.numbers, free, uncertain)
     return (*of_samples, *issues)
-
-
-def _offset_issues(
-    estimate: ParameterEstimate, search: SearchResult, entries: Sequence[int]
-) -> tuple[IdentifiabilityIssue, ...]:
-    """Constant offsets of sensors."""
-    errors = np.array(list(estimate.errors.values()))
-    if search.problem.base is None or not np.isfinite(float(search.state.cost)):
-        return ()
-    return tuple(
-        IdentifiabilityIssue(
-            f"{channel} seems to have a constant offset of {offset:.3g} +- {error:.1g}: with it parameters move by more"
-            " than their standard errors, so their intervals do not hold. Subtract it from the record and fit again.",
-            (),
-        )
-        for channel, (offset, error) in offsets_left(search.problem, search.state, entries, errors).items()
-    )
 
 
 def _sample_issues(records: tuple[Record, ...], squares: bool) -> tuple[IdentifiabilityIssue, ...]:

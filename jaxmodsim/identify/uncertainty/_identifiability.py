@@ -359,8 +359,7 @@ def _sentence(
         if positive and abs(abs(x / y) - 1) < _EQUAL:
             what, other = ("product {} {}", "ratio") if x * y < 0 else ("ratio {}/{}", "common size")
             return f"The record determines only the {what.format(a, b)}; their {other} is {how}."
-    small = 0.1
-    changes = ", ".join(f"{name} by {small * c * s:+.2g}" for name, c, s in zip(names, vector, size, strict=True))
+    changes = ", ".join(f"{name} by {0.1 * c * s:+.2g}" for name, c, s in zip(names, vector, size, strict=True))
     return (
         f"The record determines only combinations of {', '.join(names)}: a change of {changes} together hardly shows"
         f" (this direction is {how})."

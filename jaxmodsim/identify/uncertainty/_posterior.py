@@ -296,8 +296,7 @@ class Posterior(AbstractReadable):
                     )
         return tuple(sentences)
 
-    def __repr__(self) -> str:
-        return str(self)
+    __repr__ = AbstractReadable.__str__
 
 
 @table_of.register

@@ -188,9 +188,8 @@ def profile(result: FitResult, name: str, *, points: int = 6, level: float = 0.9
         raise ValueError(f"{name!r} has no profile; the parameters that have one are: {', '.join(names)}.")
     level, points = as_share(level, name="level"), as_whole(points, name="points", least=2)
     limit = as_whole(max_steps, name="max_steps", least=0)
-    threshold = float(special.fdtri(1, BLOCKS - 1, level))
     first, left, times = result, limit, 0
-    while isinstance(curve := _along(result, name, points, level, -_BELOW * threshold if left else -math.inf), _Point):
+    while isinstance(curve := _along(result, name, points, level, improve=left > 0), _Point):
         times += 1
         before = result.search_for("A profile")
         x = on_device(curve.x)
@@ -203,7 +202,7 @@ def profile(result: FitResult, name: str, *, points: int = 6, level: float = 0.9
             f"A value of {name} fitted better than the estimate: {'one search' if times == 1 else f'{times} searches'}"
             f" continued from there in {limit - left} iterations, and the RMSE fell from {fell}."
         )
-    if np.min(curve.ratio) < -_BELOW * threshold:
+    if np.min(curve.ratio) < -_BELOW * curve.threshold:
         notes.append(
             f"Some value of {name} fits better than the estimate, but the limit of {limit} iterations (max_steps) of"
             " searches that continue from there is reached."
@@ -211,9 +210,10 @@ def profile(result: FitResult, name: str, *, points: int = 6, level: float = 0.9
     return replace(curve, notes=tuple(notes))
 
 
-def _along(result: FitResult, name: str, points: int, level: float, least: float) -> Profile | _Point:
-    """The profile of a fit, or the first point whose ratio is below `least`."""
+def _along(result: FitResult, name: str, points: int, level: float, *, improve: bool) -> Profile | _Point:
+    """The profile of a fit; with `improve`, the first point that fits clearly better instead, if there is one."""
     threshold = float(special.fdtri(1, BLOCKS - 1, level))
+    least = -_BELOW * threshold if improve else -math.inf
     search = result.search_for("A profile")
     line, tangent = _line_of(result.estimate, search, name)
     estimate, names = result.values[name], search.problem.free.names
