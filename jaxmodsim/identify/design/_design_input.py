@@ -178,7 +178,7 @@ def design_input(
         # None is a limit of infinity.
         inverse = [1.0 / (limit or np.inf) / (1.0 - _MARGIN) for limit in (limits.force, limits.speed, limits.travel)]
         numbers = (t, shapes, rates, inverse, samples / count, prior_information, uncertainty)
-        return _Task(axis, *(jnp.asarray(x, float) for x in numbers), criterion)
+        return _Task(axis, *(jnp.asarray(x, float) for x in numbers), criterion=criterion)
 
     fine, coarse = task(samples), task((samples - 1) // stride + 1)
     sines = [_fill(coarse, column) for column in np.eye(2 * harmonics)[:harmonics]]

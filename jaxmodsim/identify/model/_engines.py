@@ -247,8 +247,8 @@ def run_samples(
     memory = () if controller is None else controller.memory
     samples = (t[:-1], dt, jtu.tree_map(lambda x: x[:-1], inputs), slopes)
     begin = first_modes(t[0], y0, driven(scene, jtu.tree_map(lambda x: x[0], inputs))) if exact else (y0, None)
-    carry, seen = jax.lax.scan(advance, (begin, memory), samples)
-    _, (end, _), _, final = look(t[-1], *carry, jtu.tree_map(lambda x: x[-1], inputs))
+    (at, memory), seen = jax.lax.scan(advance, (begin, memory), samples)
+    _, (end, _), _, final = look(t[-1], at, memory, jtu.tree_map(lambda x: x[-1], inputs))
     return jtu.tree_map(lambda x, y: jnp.concatenate([x, jnp.asarray(y)[None]]), seen, final), end
 
 
