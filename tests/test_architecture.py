@@ -26,13 +26,13 @@ APPLICATIONS = {
     "metrics": 634,
     "analysis": 2136,
     "orbits": 3122,
-    "identify": 9669,
+    "identify": 9525,
     "sweeps": 2093,
     "export": 1906,
     "control": 790,
     "problems": 2835,
     "plot": 1715,
-    "cli": 3396,
+    "cli": 3336,
 }
 LABORATORY = ("tests", "bench")
 ROOMS = (*CORE, *APPLICATIONS)

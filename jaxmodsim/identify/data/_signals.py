@@ -24,7 +24,7 @@ _ORDERS, _PARTS, _LEAST_PART = (2, 3, 4, 5, 6), 32, 32
 # An interval of so many medians is a gap, unless more than this share of all intervals are as long.
 _GAP, _FEW = 5.0, 0.01
 # Samples slower than this share of the top speed are left out.
-_MOVING = 0.05
+MOVING = 0.05
 # Largest offset, as a share of the record, and in samples.
 _FURTHEST_SHARE, _FURTHEST = 0.1, 500
 # Tolerance of an offset, in intervals of the samples.
@@ -34,12 +34,12 @@ _LEAST_MOVING = 100
 
 
 class SmoothedMotion(NamedTuple):
-    """A smoothed motion, shape `[samples]` each, and the number of samples at either end that smoothing distorts."""
+    """A smoothed motion, shape `[samples]` each, and the samples inside, without ends that smoothing distorts."""
 
     x: Float[np.ndarray, " samples"]
     v: Float[np.ndarray, " samples"]
     a: Float[np.ndarray, " samples"]
-    edge: int
+    inside: slice
 
 
 def smooth(x: Float[np.ndarray, " samples"], span: int) -> Float[np.ndarray, " samples"]:
@@ -86,9 +86,10 @@ def sample_noise(x: Float[np.ndarray, " samples"]) -> float:
 def differentiate(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]) -> SmoothedMotion:
     """Velocity and acceleration of a position, smoothed before either differentiation."""
     span = smooth_span(len(t))
-    position = smooth(x, span)
+    position, edge = smooth(x, span), 3 * span
     v = smooth(np.gradient(position, t), span)
-    return SmoothedMotion(position, v, np.gradient(v, t), 3 * span)
+    inside = slice(edge, -edge) if len(t) > 4 * edge else slice(None)
+    return SmoothedMotion(position, v, np.gradient(v, t), inside)
 
 
 def start_state(record: Record, channel: str | None = None) -> tuple[float, float]:
@@ -163,7 +164,7 @@ def _regression(record: Record, name: str, furthest: int) -> Callable[[float], t
         return smooth(smooth(x, span), span)
 
     v = np.gradient(smoothed(without_outliers(record.measured)), t)
-    moving = np.abs(v) > _MOVING * np.max(np.abs(v))
+    moving = np.abs(v) > MOVING * np.max(np.abs(v))
     moving[:edge] = moving[-edge:] = False
     if np.count_nonzero(moving) < _LEAST_MOVING:
         return None

@@ -284,7 +284,7 @@ def _known(
 
 @eqx.filter_jit
 def _share(task: _Task, x: Float[Array, " weights"], runs: tuple[int, ...] = ()) -> Float[Array, ""]:
-    """The largest share of a limit, by the reference and its force; `runs`: steps for every sample in runs as well."""
+    """The largest share of a limit, by the reference, its force, and `runs` with so many steps a sample."""
     axis = task.axis
     force = feed_forward(axis, task.t, *task.motion(x))
     shares = [jnp.max(jnp.abs(task.shares(x, force)))]

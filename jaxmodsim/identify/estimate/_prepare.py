@@ -119,10 +119,12 @@ def prepare(scene: Scene, records: Record | Sequence[Record], free: Sequence[str
     _check_inputs(scene, several)
     for _, module in modules_of(scene):
         check_ranges(module)
-    states = _states(scene, several, options)
     observables = by_channel(options.observe, several)
-    check_observables(observables, scene, _first(states))
-    own = local_names(_first(states))
+    states = _states(scene, several, observables, options)
+    first = jax.tree.map(lambda x: on_device(np.asarray(x)[0]), states)
+    check_scene(scene, first)
+    check_observables(observables, scene, first)
+    own = local_names(first)
     local, shared = _split_free(free, own)
     if options.shooting is not None:
         linked = options.shooting.jump is not None
@@ -233,12 +235,11 @@ def _check_inputs(scene: Scene, records: tuple[Record, ...]) -> None:
                 )
 
 
-def _states(scene: Scene, records: tuple[Record, ...], options: FitOptions) -> State:
+def _states(scene: Scene, records: tuple[Record, ...], observables: Observables, options: FitOptions) -> State:
     """Initial states of the records, with a leading axis of records."""
     count, known = len(records), {"q0": options.q0, "qd0": options.qd0}
     known = {name: x if x is None else as_reals(x, name=name) for name, x in known.items()}
     dof = max((np.shape(x)[-1] for x in known.values() if x is not None and np.ndim(x) > 0), default=1)
-    observables = by_channel(options.observe, records)
     measured = [np.stack(each) for each in zip(*(measured_start(x, observables, dof) for x in records), strict=True)]
     starts = []
     for value, shown in zip(known.values(), measured, strict=True):
@@ -250,9 +251,7 @@ def _states(scene: Scene, records: tuple[Record, ...], options: FitOptions) -> S
             )
         starts.append(np.broadcast_to(array, (count, dof)))
     q, qd = (on_device(np.array(x, jnp.result_type(float))) for x in starts)
-    states = initial_states(scene, q, qd)
-    check_scene(scene, _first(states))
-    return states
+    return initial_states(scene, q, qd)
 
 
 @eqx.filter_jit
@@ -270,10 +269,8 @@ def _unknown(
     dof = sum(name.startswith("q0[") for name in own)
     seen = set(coordinates_seen(observables, dof).values())
     shown = {f"q0[{i}]": {f"q[{i}]"} for i in range(dof)} | {f"qd0[{i}]": {f"q[{i}]", f"qd[{i}]"} for i in range(dof)}
-    known = {"q0": options.q0 is not None, "qd0": options.qd0 is not None}
-    return tuple(
-        name for name, by in shown.items() if by & seen and name not in local and not known[name.partition("[")[0]]
-    )
+    names = [name for name, by in shown.items() if by & seen and name not in local]
+    return tuple(name for name in names if getattr(options, name.partition("[")[0]) is None)
 
 
 def _shown_by_opening(
@@ -297,10 +294,6 @@ def _shown_by_opening(
             ]
         known[channel] = on_device(weights)
     return known if unknown else {}
-
-
-def _first(states: State) -> State:
-    return jax.tree.map(lambda x: on_device(np.asarray(x)[0]), states)
 
 
 def _split_free(free: Sequence[str], own: tuple[str, ...]) -> tuple[tuple[str, ...], Sequence[str]]:

@@ -178,8 +178,7 @@ def state_at(problem: FitProblem, x: Float[Array, " n"]) -> SearchState:
 @eqx.filter_jit
 def steps_side_by_side(problem: FitProblem, axes: PyTree[int | None], states: SearchState, rtol: Array) -> SearchState:
     """One iteration of a batch of searches; `axes`: which numbers of the problem have a leading axis."""
-    one = lambda problem, state: levenberg_marquardt_step(problem.evaluate, problem.loss, problem.box, state, rtol)  # noqa: E731
-    moved = eqx.filter_vmap(one, in_axes=(axes, 0))(problem, states)
+    moved = eqx.filter_vmap(step, in_axes=(axes, 0, None))(problem, states, rtol)
 
     def keep(new: Array, old: Array) -> Array:
         done = jnp.reshape(states.done > 0, (-1,) + (1,) * (old.ndim - 1))
@@ -328,4 +327,4 @@ def _rescaled(search: SearchResult, problem: FitProblem) -> SearchResult:
     residual = on_device(np.asarray(search.state.residual) * factor)
     jacobian = on_device(np.asarray(search.state.jacobian) * factor[:, None])
     state = search.state._replace(residual=residual, jacobian=jacobian, cost=old.loss.cost(residual))
-    return SearchResult(problem, state, search.iterations, search.ending)
+    return replace(search, problem=problem, state=state)

@@ -90,12 +90,10 @@ class Staged(AbstractInitializer):
 
 def _sampled(problem: FitProblem) -> _Sampled:
     """All runs, concatenated, without their ends, which smoothing distorts."""
-    parts = []
-    law_alone = problem.base is None
-    if problem.base is not None and problem.base.q.shape[1] != 1:
-        raise ValueError("Staged() needs a scene with one coordinate; pass start values, or MultiStart(...).")
-    position = ""
-    if not law_alone:
+    parts, position, law_alone = [], "", problem.base is None
+    if problem.base is not None:
+        if problem.base.q.shape[1] != 1:
+            raise ValueError("Staged() needs a scene with one coordinate; pass start values, or MultiStart(...).")
         seen = coordinates_seen(problem.engine.observables, 1)
         position = next((name for name, entry in seen.items() if entry == "q[0]"), "")
         if not position:
@@ -109,17 +107,15 @@ def _sampled(problem: FitProblem) -> _Sampled:
         t = samples.t[:count]
         inputs = {name: column[:count] for name, column in samples.inputs.items()}
         x = inputs["x"] if law_alone else samples.measured[position][:count]
-        motion = differentiate(t, x)
-        span = smooth_span(count)
+        motion, span = differentiate(t, x), smooth_span(count)
         force = None
         if law_alone:
             force = smooth(next(iter(samples.measured.values()))[:count], span)
             if "normal" in inputs:
                 force = force / np.maximum(inputs["normal"], 1e-12)
-        inside = slice(motion.edge, -motion.edge) if count > 4 * motion.edge else slice(None)
-        smoothed = {name: smooth(column, span)[inside] for name, column in inputs.items()}
-        columns = (t, motion.x, motion.v, motion.a)
-        parts.append((*(x[inside] for x in columns), smoothed, None if force is None else force[inside]))
+        smoothed = {name: smooth(column, span)[motion.inside] for name, column in inputs.items()}
+        columns = (x[motion.inside] for x in (t, motion.x, motion.v, motion.a))
+        parts.append((*columns, smoothed, None if force is None else force[motion.inside]))
     return _Sampled(*jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)), *parts))
 
 

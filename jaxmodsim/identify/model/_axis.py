@@ -12,12 +12,10 @@ from ..._core.parameters import ranges_of
 from ...friction import AbstractLaw, Coulomb, Viscous, asymmetric, laws
 from ...scene import AbstractEffect, AppliedForce, Friction, Scene, replace_numbers
 from ..data._record import Record
-from ..data._signals import differentiate, smooth, smooth_span, without_outliers
+from ..data._signals import MOVING, differentiate, smooth, smooth_span, without_outliers
 
 # Share of the variance of a force below which a regression explains it well enough to detect a wrong sign.
 _EXPLAINED = 0.5
-# Samples slower than this share of the top speed are left out.
-_MOVING = 0.05
 # Friction as a share of the root mean square of the force, if the regression gives no positive number.
 _FRICTION_SHARE = 0.1
 
@@ -73,10 +71,9 @@ def estimate_axis(record: Record) -> AxisEstimate:
                 " mass and friction show in the motion under a force that changes. Is it the right column?"
             )
     motion, span = differentiate(record.t, without_outliers(record.measured)), smooth_span(len(record.t))
-    inside = slice(motion.edge, -motion.edge) if len(record.t) > 4 * motion.edge else slice(None)
-    v, a, u = (x[inside] for x in (motion.v, motion.a, smooth(record.inputs["u"], span)))
+    v, a, u = (x[motion.inside] for x in (motion.v, motion.a, smooth(record.inputs["u"], span)))
     top = float(np.max(np.abs(v)))
-    moving = np.abs(v) > _MOVING * top
+    moving = np.abs(v) > MOVING * top
     columns = np.column_stack([a, v, np.sign(v), np.ones_like(v)])[moving]
     m, Fv, Fc, offset = weights = np.linalg.lstsq(columns, u[moving], rcond=None)[0]
     dissipated = Fv * float(np.mean(v**2)) + Fc * float(np.mean(np.abs(v)))

@@ -200,10 +200,7 @@ def _from_smaller(free: Sequence[str], judged: Mapping[str, CrossValidated]) -> 
     """From the fit of the largest model all of whose parameters are among `free`, by the last parts of their names."""
     names = {last_part(name) for name in free}
     ends = [
-        {
-            last_part(name): on_device(each.values[name])
-            for name in finished(each.search_for("A comparison")).problem.free.names
-        }
+        {last_part(name): on_device(each.values[name]) for name in each.search_for("A comparison").problem.free.names}
         for each, _, _ in judged.values()
     ]
     nested = [values for values in ends if set(values) <= names]
@@ -221,8 +218,7 @@ def _validated(
     model, free, folds, initializers = candidate.scene, candidate.free, options.folds, options.initializers
 
     def search_options(fold: int | None, rtol: float = ENOUGH) -> SearchOptions:
-        show = report
-        progress = None if show is None else lambda number, rms, _: show(name, fold, number, rms)
+        progress = None if report is None else lambda number, rms, _: report(name, fold, number, rms)
         return SearchOptions(rtol, options.max_steps, progress)
 
     if isinstance(model, AbstractLaw):

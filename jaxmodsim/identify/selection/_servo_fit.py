@@ -293,20 +293,16 @@ def _calibrated(
     """
     spread = _spread(centre, np.stack([angles for _, angles in without]))
     errors = [(i, np.abs(angles[i] - measured[i])[counts[i]]) for out, angles in without for i in out]
-    best: dict[str, float] = {}
+    bands = []
     for share in _SHARES:
         unit = _half({"factor": 1.0, "least": _LEAST, "share": share}, spread, centre)
         units = [unit[i][counts[i]] for i, _ in errors]
         ratios = [error / own for (_, error), own in zip(errors, units, strict=True)]
         weights = np.concatenate([np.full(x.size, 1.0 / x.size) for x in ratios])
-        every = np.concatenate(ratios)
-        order = np.argsort(every)
-        reached = np.cumsum(weights[order]) / np.sum(weights)
-        factor = float(every[order][min(np.searchsorted(reached, level), every.size - 1)])
+        factor = float(np.quantile(np.concatenate(ratios), level, weights=weights, method="inverted_cdf"))
         width = float(np.mean([np.mean(factor * own) for own in units]))
-        if not best or width < best["mean"]:
-            best = {"level": level, "factor": factor, "least": _LEAST, "share": share, "mean": width}
-    return best
+        bands.append({"level": level, "factor": factor, "least": _LEAST, "share": share, "mean": width})
+    return min(bands, key=lambda band: band["mean"])
 
 
 def _problem(start: Servo, law: str, records: tuple[Record, ...], prior: PriorNumbers) -> FitProblem:
