@@ -218,7 +218,8 @@ def _validated(
     model, free, folds, initializers = candidate.scene, candidate.free, options.folds, options.initializers
 
     def search_options(fold: int | None, rtol: float = ENOUGH) -> SearchOptions:
-        progress = None if report is None else lambda number, rms, _: report(name, fold, number, rms)
+        show = report
+        progress = None if show is None else lambda number, rms, _: show(name, fold, number, rms)
         return SearchOptions(rtol, options.max_steps, progress)
 
     if isinstance(model, AbstractLaw):
