@@ -10,7 +10,6 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from .._core.arrays import PerDof, Scalar
 from .._core.monotone import solve_monotone
-from ..friction import Sign
 from ._dynamics import State, load_and_mobility
 from ._scene import Scene
 from .forces._friction import Friction
@@ -52,16 +51,16 @@ def check_step(scene: Scene) -> None:
         )
     for name, effect in scene.friction.items():
         law, start = type(effect.law).__name__, f"ImplicitFriction: friction {name!r}"
-        if effect.event_driven or isinstance(effect.law, Sign):
-            raise ValueError(
-                f"{start} has a force that jumps at rest ({law}), so that position and velocity do not tell it: wrap"
-                " the law as Regularized(law, width), however small the width, take a law with bristles (LuGre, Dahl,"
-                " ElastoPlastic), or run it by events, with another solver."
-            )
         if effect.karnopp:
             raise ValueError(
                 f"{start} is a DeadZone, which holds by knowing all other forces: wrap the law as Regularized(law,"
                 " width) instead, or use another solver."
+            )
+        if effect.event_driven or effect.law.jumps:
+            raise ValueError(
+                f"{start} has a force that jumps at rest ({law}), so that position and velocity do not tell it: wrap"
+                " the law as Regularized(law, width), however small the width, take a law with bristles (LuGre, Dahl,"
+                " ElastoPlastic), or run it by events, with another solver."
             )
         if effect.load_constraint is not None:
             raise ValueError(

@@ -16,7 +16,7 @@ from .._core.cholesky import cholesky_pivots
 from .._core.functions import depends_on
 from .._core.parameters import check_ranges, modules_of, range_checks
 from .._core.scalarise import in_scalars
-from ..friction import DeadZone, Regularized, Sign
+from ..friction import AbstractLaw, Regularized
 from ..mechanics import Contact, constraint_residual, motion_equations, quadratic
 from ..scene import Scene, State, check_scene, describe_series, from_dynamics, quantity_of
 from ..solvers import ACCUMULATION, TOO_MANY
@@ -161,8 +161,8 @@ def outcome_messages(scene: Scene, dof: int) -> tuple[str, ...]:
     )
     ranges = tuple(text for text, _ in range_checks(scene))
     general: list[str] = list(_GENERAL)
-    laws = [module for _, module in modules_of(scene) if isinstance(module, DeadZone | Sign)]
-    for code, asked in ((MAX_STEPS, bool(laws or not scene.contacts)), (STEP_TOO_SMALL, bool(laws))):
+    jumps = any(isinstance(module, AbstractLaw) and module.jumps for _, module in modules_of(scene))
+    for code, asked in ((MAX_STEPS, jumps or not scene.contacts), (STEP_TOO_SMALL, jumps)):
         general[code] += _CHATTER[code] if asked else ""
     if scene.contacts:
         names = ", ".join(map(repr, scene.contacts))

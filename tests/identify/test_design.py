@@ -364,6 +364,10 @@ def test_scenes_that_need_events_and_criteria_that_are_words_are_refused():
     exact = jms.Scene(box().lagrangian, params=box().params, effects=(drive, jms.Friction(jms.Coulomb(8.0))))
     with pytest.raises(ValueError, match=r"friction would need events.*Regularized\(law, width\)"):
         design_input(exact, ("m",), LIMITS, **OPTIONS)
+    for law in (jms.Sign(jms.Coulomb(8.0)), jms.DeadZone(jms.Coulomb(8.0), 1e-3)):
+        jumps = jms.Scene(box().lagrangian, params=box().params, effects=(drive, jms.Friction(law)))
+        with pytest.raises(ValueError, match=f"No derivatives through friction 'friction' .{type(law).__name__}"):
+            design_input(jumps, ("m",), LIMITS, **OPTIONS)
     # Run-time type checks of the tests may come before our own; both name the argument.
     with pytest.raises((ValueError, TypeError), match="criterion"):
         design_input(box(), ("m",), LIMITS, criterion="D", **OPTIONS)  # pyright: ignore[reportArgumentType]

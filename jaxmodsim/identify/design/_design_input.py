@@ -231,6 +231,8 @@ def _axis(
             f"design_input differentiates a run with fixed steps, but {', '.join(scene.mode_names)} would need"
             " events: wrap a law, as in Regularized(law, width)."
         )
+    if why := scene.without_derivatives:
+        raise ValueError(why)
     if input_name in free:
         raise ValueError(f"{input_name} is the input and cannot be free.")
     position = jnp.asarray([0.0] if q0 is None else q0, float)
