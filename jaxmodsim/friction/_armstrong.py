@@ -25,13 +25,13 @@ class ArmstrongState(NamedTuple):
     - `z`: deflection of the contact [m].
     - `rise`: current Stribeck friction, as a fraction of Fs - Fc.
     - `magnitude`: value of `rise` in the limit of zero speed; in stick it follows `rise`.
-    - `slips`: 1 in slip, from yielding until the motion reverses; 0 in stick.
+    - `slip`: slip [m] since the contact yielded, at most `0.02 Fc/sigma0`, until the motion reverses; 0 in stick.
     """
 
     z: Scalar
     rise: Scalar
     magnitude: Scalar
-    slips: Scalar
+    slip: Scalar
 
 
 @register_law
@@ -124,18 +124,19 @@ class Armstrong(AbstractDynamicLaw):
         return ArmstrongState(jnp.zeros_like(v), jnp.ones_like(v), jnp.ones_like(v), jnp.zeros_like(v))
 
     def zdot(self, v: Scalar, z: ArmstrongState) -> ArmstrongState:
-        """Rates of the state [m/s, 1/s, 1/s, 1/s] at slip velocity `v` [m/s]."""
+        """Rates of the state [m/s, 1/s, 1/s, m/s] at slip velocity `v` [m/s]."""
         u = z.z * jnp.sign(v) / self._limit(z.rise)
         share = slip_fraction(u, jnp.asarray(_CORNER, u.dtype))
-        slides, missing = z.slips * self._moves(v), 1.0 - z.rise
+        slips = z.slip / self._turn()
+        slides, missing = slips * self._moves(v), 1.0 - z.rise
         falls = (z.magnitude * self._steady(v) - z.rise) / self.tau
         rise = slides * falls + (1.0 - slides) * missing * missing / self.gamma
-        turns = jnp.where(v * z.z < 0, -z.slips, share * (1.0 - z.slips))
+        turns = jnp.where(v * z.z < 0, -slips, share * (1.0 - slips))
         return ArmstrongState(
             v * (1.0 - share),
             rise,
             (1.0 - slides) * (z.rise - z.magnitude) / self.tau,
-            jnp.abs(v) / self._turn() * turns,
+            jnp.abs(v) * turns,
         )
 
     def _turn(self) -> Scalar:
@@ -158,8 +159,9 @@ class Armstrong(AbstractDynamicLaw):
         lost = jnp.maximum(
             distance - jnp.abs(advance_elastoplastic(v, z.z, dt, self._limit(z.rise), corner) - z.z), 0.0
         )
-        before = z.slips * jnp.exp(-back / self._turn())
-        slips = 1.0 - (1.0 - before) * jnp.exp(-lost / self._turn())
+        turn = self._turn()
+        before = z.slip / turn * jnp.exp(-back / turn)
+        slips = 1.0 - (1.0 - before) * jnp.exp(-lost / turn)
         share = jnp.maximum(before, lost / jnp.where(distance > 0, distance, 1.0))
         sliding = jnp.minimum(share, 1.0) * self._moves(v) * dt
         resting = dt - sliding
@@ -167,7 +169,8 @@ class Armstrong(AbstractDynamicLaw):
         magnitude = 1.0 - missing + (z.magnitude - 1.0 + missing) * jnp.exp(-resting / self.tau)
         goal = magnitude * self._steady(v)
         rise = goal + (1.0 - missing - goal) * jnp.exp(-sliding / self.tau)
-        return ArmstrongState(advance_elastoplastic(v, z.z, dt, self._limit(rise), corner), rise, magnitude, slips)
+        deflection = advance_elastoplastic(v, z.z, dt, self._limit(rise), corner)
+        return ArmstrongState(deflection, rise, magnitude, turn * slips)
 
     def passivity(self) -> Passivity:
         """Always passive: the contact slips only in the direction of its load, so `sigma0 z (v - z') >= 0`."""

@@ -2,7 +2,7 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .._core.arrays import is_known
 from ._observe import find_series, read_series
@@ -11,7 +11,8 @@ from ._trajectory import Trajectory, trajectory
 
 # Number of steps with the largest estimates that are searched for the peak, and of samples in each of them.
 _INTERVALS, _SAMPLES = 8, 16
-# Relative difference up to which a peak counts as that of an event or of a saved time, which have derivatives.
+# Relative difference up to which a peak at the end of a step counts as that of an event or of a saved time, whose times
+# have derivatives. A turning point within a step has its derivative at its own time: a saved time close by does not.
 _CORNER = 1e-6
 
 
@@ -30,14 +31,17 @@ def peak_of(run: Trajectory, name: str) -> Float[Array, ""]:
     x = read_series(run, series)
     # Of equal peaks the first counts, with its derivative: `jnp.max` has a mixture of theirs.
     saved = jax.lax.top_k(jnp.where(jnp.isfinite(run.t), jnp.abs(x), 0.0), 1)[0][0]
-    between = _between(run, name)
     corner = jax.lax.top_k(jnp.append(jnp.abs(run.event_sides(series)), 0.0), 1)[0][0]
-    smooth = jnp.where(saved >= (1.0 - _CORNER) * between, saved, between)
-    return jnp.where(corner >= (1.0 - _CORNER) * smooth, corner, smooth)
+    at_node = jnp.where(corner >= (1.0 - _CORNER) * saved, corner, saved)
+    between, turns = _between(run, name)
+    return jnp.where(at_node >= jnp.where(turns, 1.0 + _CORNER, 1.0 - _CORNER) * between, at_node, between)
 
 
-def _between(run: Trajectory, name: str) -> Float[Array, ""]:
-    """The largest magnitude within steps: a first repeat of the run selects steps, a second one samples them."""
+def _between(run: Trajectory, name: str) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+    """The largest magnitude within steps, and whether it is a turning point.
+
+    A first repeat of the run selects steps, a second one samples them.
+    """
     series = find_series(run, name)
     plain = run.request._replace(ts=None).choosing(log=0, audited=False)
     nodes = solve(jax.lax.stop_gradient(plain.choosing(max_steps=_most_steps(run), series=series))).nodes
@@ -53,7 +57,9 @@ def _between(run: Trajectory, name: str) -> Float[Array, ""]:
     near = plain._replace(ts=jnp.ravel(ts))
     samples = jnp.reshape(read_series(trajectory(near, solve(near)), series), ts.shape)
     samples = jnp.where(within[:, None] & jnp.isfinite(samples), samples, 0.0)
-    return jax.lax.top_k(jax.vmap(_vertex)(samples), 1)[0][0]
+    peaks, turns = jax.vmap(_vertex)(samples)
+    highest, at = jax.lax.top_k(peaks, 1)
+    return highest[0], turns[at[0]]
 
 
 def _most_steps(run: Trajectory) -> int:
@@ -90,10 +96,11 @@ def _turns(step: Float[Array, " steps"], x: Float[Array, " nodes"], v: Float[Arr
     return jnp.where(turns, cubic, 0.0)
 
 
-def _vertex(x: Float[Array, " samples"]) -> Float[Array, ""]:
-    """Largest magnitude within a step by the parabola through the largest sample and its neighbours.
+def _vertex(x: Float[Array, " samples"]) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+    """Largest magnitude within a step, and whether it is a turning point rather than an end of the step.
 
-    The position of the vertex is a constant: the series is stationary there, or the step ends.
+    It lies on the parabola through the largest sample and its neighbours. Its position there is a constant: the series
+    is stationary, or the step ends.
     """
     fixed = jnp.abs(jax.lax.stop_gradient(x))
     j = jnp.clip(jnp.argmax(fixed), 1, _SAMPLES - 2)
@@ -101,8 +108,9 @@ def _vertex(x: Float[Array, " samples"]) -> Float[Array, ""]:
     y = y * jnp.sign(jax.lax.stop_gradient(y[1]))
     before, here, after = jax.lax.stop_gradient(y)
     bend = before - 2.0 * here + after
-    d = 0.5 * (before - after) / jnp.where(bend < 0, bend, -1.0)
+    vertex = 0.5 * (before - after) / jnp.where(bend < 0, bend, -1.0)
     # Up to the ends of the step, half a sample beyond the outer ones; without a vertex the largest sample.
     least, most = jnp.where(j == 1, -1.5, -1.0), jnp.where(j == _SAMPLES - 2, 1.5, 1.0)
-    d = jnp.clip(jnp.where(bend < 0, d, jnp.sign(after - before) * most), least, most)
-    return 0.5 * d * (d - 1.0) * y[0] + (1.0 - d**2) * y[1] + 0.5 * d * (d + 1.0) * y[2]
+    d = jnp.clip(jnp.where(bend < 0, vertex, jnp.sign(after - before) * most), least, most)
+    highest = 0.5 * d * (d - 1.0) * y[0] + (1.0 - d**2) * y[1] + 0.5 * d * (d + 1.0) * y[2]
+    return highest, (bend < 0) & (d == vertex)

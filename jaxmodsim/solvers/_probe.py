@@ -24,8 +24,9 @@ _OF_ZERO = 1e-3
 _AT_REST, _IN_MOTION, _MOVES = 0.1, 150.0, 0.01
 # Least magnitude of a tangent, in parts of the largest in its array.
 _OF_ARRAY = 1e-3
-# A tangent that is zero up to a kink of the field begins in proportion to the step over it, as does its error, whatever
-# the step. It counts as large as after this part of a late step, whose length decreases by a factor with each step.
+# A tangent that is small up to a kink of the field grows in proportion to the step over it, as does its error, whatever
+# the step. If at this pace it is far larger after this part of a late step, it counts as that large. The length of late
+# steps decreases by a factor with each step.
 _SOON, _LATE = 0.01, 0.9
 # Errors of a tangent that are noise: in parts of `atol`, in roundings of the state, and in roundings of the tangent.
 _OF_ATOL, _ROUNDINGS, _RESOLVED = 1e-6, 16.0, 64.0
@@ -139,11 +140,11 @@ class ProbedStep(NamedTuple):
         ends = jtu.tree_map(lambda a, b: jnp.maximum(jnp.abs(a), jnp.abs(b)), _integrated(held), _integrated(y1))
         late = jnp.maximum(h, _LATE * probe.length)
 
-        def scale(magnitude: Array, now: Array, before: Array) -> Array:
-            begins = before < _OF_ARRAY * now
-            return jnp.where(begins, jnp.maximum(magnitude, now * (_SOON * late / h)), magnitude)
+        def scale(magnitude: Array, before: Array, x0: Array, x1: Array) -> Array:
+            soon = jnp.abs(x1 - x0) * (_SOON * late / h)
+            return jnp.where(before < _OF_ARRAY * soon, jnp.maximum(magnitude, soon), magnitude)
 
-        scales = jtu.tree_map(scale, magnitude, now, probe.magnitude)
+        scales = jtu.tree_map(scale, magnitude, probe.magnitude, _integrated(probe.tangent[0]), _integrated(tangent[0]))
         errors = jnp.where(probe.counts > 0, self._size((t0, t1), error, error_of_probe, scales, ends), 0.0)
         after = ProbeTangent(tangent, magnitude, elapsed, late, jnp.ones_like(probe.counts))
         return Probed(y1, after), (error, errors), dense, state1, result

@@ -122,18 +122,43 @@ def test_armstrong_friction_lags_by_its_time_constant() -> None:
     np.testing.assert_allclose(force, levels[1] + (levels[0] - levels[1]) * np.exp(-t / 0.02), rtol=2e-3)
 
 
-def test_derivatives_of_armstrong_on_a_belt() -> None:
-    """Against differences of tight runs: the contact yields at a kink, up to which one state is zero."""
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        [2.0, 30.0, 0.13, 0.01],
+        # A slip ends after 0.42 s: the magnitude, which has not moved in it, begins to follow the rise.
+        [0.543, 31.93, 0.102, 0.303],
+    ],
+    ids=["yields", "slip ends"],
+)
+def test_derivatives_of_armstrong_on_a_belt(numbers: list[float]) -> None:
+    """Against differences of tight runs: states whose derivatives are zero, or small, up to a kink."""
 
-    def end(x: Any, rtol: Any) -> Any:
-        Fs, tau, k = x
-        law = jms.Armstrong(sigma0=750.0, Fc=1.5, Fs=Fs, vs=0.2, Fv=0.1, tau=tau, gamma=2.0)
-        scene = jms.Scene(pulled, {"m": 2.0, "k": k, "v": 0.0}, (jms.Friction(law, belt_velocity=0.13),))
-        return jms.simulate(scene, [0.0], [0.05], 1.0, rtol=rtol).q[-1, 0]
+    def end(x: Any, rtol: Any, atol: Any) -> Any:
+        m, k, belt, q0 = x
+        law = jms.Armstrong(sigma0=750.0, Fc=1.5, Fs=1.75, vs=0.2, Fv=0.1, tau=0.05, gamma=2.0)
+        scene = jms.Scene(pulled, {"m": m, "k": k, "v": 0.0}, (jms.Friction(law, belt_velocity=belt),))
+        return jms.simulate(scene, q0[None], [0.0], 1.0, rtol=rtol, atol=atol).q[-1, 0]
 
-    x, run = jnp.array([1.75, 0.05, 30.0]), jax.jit(end)
-    wanted = gradient_by_differences(lambda x: run(x, 1e-11), x, 3e-3)
-    np.testing.assert_allclose(jax.jit(jax.grad(end))(x, 1e-6), wanted, rtol=1e-4)
+    x, run = jnp.array(numbers), jax.jit(end)
+    wanted = gradient_by_differences(lambda x: run(x, 1e-11, 1e-13), x, 1e-3)
+    np.testing.assert_allclose(jax.jit(jax.grad(end))(x, 1e-6, 1e-9), wanted, rtol=1e-4)
+
+
+def test_armstrong_in_single_precision() -> None:
+    """The contact yields within 4e-5 m: float32 resolves that, also far from the start of time."""
+
+    def end(kind: Any, t0: float) -> Any:
+        number = lambda x: jnp.asarray(x, kind)  # noqa: E731
+        law = jms.Armstrong(*map(number, (750.0, 1.5, 1.75, 0.2, 0.1, 0.05, 2.0)))
+        params = {"m": number(0.543), "k": number(31.93), "v": number(0.0)}
+        scene = jms.Scene(pulled, params, (jms.Friction(law, belt_velocity=number(0.102)),))
+        run = jms.simulate(scene, number([0.303]), number([0.0]), number(t0 + 3.0), t0=number(t0), rtol=1e-5)
+        assert run.q.dtype == kind
+        return run.q[-1, 0]
+
+    for t0 in (0.0, 10.0):
+        np.testing.assert_allclose(end(jnp.float32, t0), end(jnp.float64, t0), rtol=1e-3)
 
 
 def test_the_limit_cycle_of_the_1995_set() -> None:
