@@ -14,6 +14,8 @@ _INTERVALS, _SAMPLES = 8, 16
 # Relative difference up to which a peak at the end of a step counts as that of an event or of a saved time, whose times
 # have derivatives. A turning point within a step has its derivative at its own time: a saved time close by does not.
 _CORNER = 1e-6
+# Third difference of four samples, in parts of their range, above which they jump; a smooth peak has a far smaller one.
+_JUMP = 0.5
 
 
 def peak_of(run: Trajectory, name: str) -> Float[Array, ""]:
@@ -100,12 +102,15 @@ def _vertex(x: Float[Array, " samples"]) -> tuple[Float[Array, ""], Bool[Array, 
     """Largest magnitude within a step, and whether it is a turning point rather than an end of the step.
 
     It lies on the parabola through the largest sample and its neighbours. Its position there is a constant: the series
-    is stationary, or the step ends.
+    is stationary, or the step ends. Beside a jump it is the largest sample: a step contains one if it begins before an
+    event and ends behind it.
     """
-    fixed = jnp.abs(jax.lax.stop_gradient(x))
-    j = jnp.clip(jnp.argmax(fixed), 1, _SAMPLES - 2)
-    y = jax.lax.dynamic_slice(x, (j - 1,), (3,))
-    y = y * jnp.sign(jax.lax.stop_gradient(y[1]))
+    fixed = jax.lax.stop_gradient(x)
+    at = jnp.argmax(jnp.abs(fixed))
+    j = jnp.clip(at, 1, _SAMPLES - 2)
+    four = jax.lax.dynamic_slice(fixed, (jnp.clip(j - 1, 0, _SAMPLES - 4),), (4,))
+    jumps = jnp.abs(jnp.diff(four, 3)[0]) > _JUMP * (jnp.max(four) - jnp.min(four))
+    y = jax.lax.dynamic_slice(x, (j - 1,), (3,)) * jnp.sign(fixed[j])
     before, here, after = jax.lax.stop_gradient(y)
     bend = before - 2.0 * here + after
     vertex = 0.5 * (before - after) / jnp.where(bend < 0, bend, -1.0)
@@ -113,4 +118,4 @@ def _vertex(x: Float[Array, " samples"]) -> tuple[Float[Array, ""], Bool[Array, 
     least, most = jnp.where(j == 1, -1.5, -1.0), jnp.where(j == _SAMPLES - 2, 1.5, 1.0)
     d = jnp.clip(jnp.where(bend < 0, vertex, jnp.sign(after - before) * most), least, most)
     highest = 0.5 * d * (d - 1.0) * y[0] + (1.0 - d**2) * y[1] + 0.5 * d * (d + 1.0) * y[2]
-    return highest, (bend < 0) & (d == vertex)
+    return jnp.where(jumps, x[at] * jnp.sign(fixed[at]), highest), ~jumps & (bend < 0) & (d == vertex)

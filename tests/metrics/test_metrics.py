@@ -269,6 +269,26 @@ def test_a_saved_time_beside_a_peak_does_not_give_its_derivative(beside: float) 
     np.testing.assert_allclose(slope, a, rtol=5e-5)
 
 
+def test_the_peak_of_a_force_that_jumps_is_within_its_limits() -> None:
+    """Steps that contain an event have samples on both sides of the jump: no parabola passes through them."""
+    rng = np.random.default_rng(11)
+    belts = np.stack([rng.uniform(0.5, 2.0, 64), rng.uniform(5.0, 50.0, 64), rng.uniform(0.05, 0.5, 64)], 1)
+
+    def lagrangian(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del t
+        return 0.5 * p["m"] * qd[0] ** 2 - 0.5 * p["k"] * q[0] ** 2
+
+    @jax.jit
+    @jax.vmap
+    def peak(numbers: Any) -> Any:
+        m, k, belt = numbers
+        friction = jms.Friction(jms.asymmetric(jms.Coulomb(1.5), Fc=2.0), belt_velocity=belt)
+        run = jms.simulate(jms.Scene(lagrangian, {"m": m, "k": k}, (friction,)), [-0.3], [0.0], 3.0)
+        return metrics.peak("friction")(run)
+
+    np.testing.assert_allclose(peak(belts), 2.0, rtol=1e-5)
+
+
 def test_of_equal_peaks_one_has_the_derivative():
     @jax.jit
     @jax.grad
