@@ -118,4 +118,4 @@ def _vertex(x: Float[Array, " samples"]) -> tuple[Float[Array, ""], Bool[Array, 
     least, most = jnp.where(j == 1, -1.5, -1.0), jnp.where(j == _SAMPLES - 2, 1.5, 1.0)
     d = jnp.clip(jnp.where(bend < 0, vertex, jnp.sign(after - before) * most), least, most)
     highest = 0.5 * d * (d - 1.0) * y[0] + (1.0 - d**2) * y[1] + 0.5 * d * (d + 1.0) * y[2]
-    return jnp.where(jumps, x[at] * jnp.sign(fixed[at]), highest), ~jumps & (bend < 0) & (d == vertex)
+    return jnp.where(jumps, jnp.abs(x[at]), highest), ~jumps & (bend < 0) & (d == vertex)

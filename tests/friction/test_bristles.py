@@ -123,24 +123,29 @@ def test_armstrong_friction_lags_by_its_time_constant() -> None:
 
 
 @pytest.mark.parametrize(
-    "numbers",
+    ("at", "varied"),
     [
-        [2.0, 30.0, 0.13, 0.01],
+        ({"m": 2.0, "k": 30.0, "belt": 0.13, "q0": 0.0, "qd0": 0.05, "Fs": 1.75, "tau": 0.05}, ("Fs", "tau", "k")),
         # A slip ends after 0.42 s: the magnitude, which has not moved in it, begins to follow the rise.
-        [0.543, 31.93, 0.102, 0.303],
+        (
+            {"m": 0.543, "k": 31.93, "belt": 0.102, "q0": 0.303, "qd0": 0.0, "Fs": 1.75, "tau": 0.05},
+            ("m", "k", "belt", "q0"),
+        ),
     ],
     ids=["yields", "slip ends"],
 )
-def test_derivatives_of_armstrong_on_a_belt(numbers: list[float]) -> None:
+def test_derivatives_of_armstrong_on_a_belt(at: dict[str, float], varied: tuple[str, ...]) -> None:
     """Against differences of tight runs: states whose derivatives are zero, or small, up to a kink."""
 
     def end(x: Any, rtol: Any, atol: Any) -> Any:
-        m, k, belt, q0 = x
-        law = jms.Armstrong(sigma0=750.0, Fc=1.5, Fs=1.75, vs=0.2, Fv=0.1, tau=0.05, gamma=2.0)
-        scene = jms.Scene(pulled, {"m": m, "k": k, "v": 0.0}, (jms.Friction(law, belt_velocity=belt),))
-        return jms.simulate(scene, q0[None], [0.0], 1.0, rtol=rtol, atol=atol).q[-1, 0]
+        n = at | dict(zip(varied, x, strict=True))
+        law = jms.Armstrong(sigma0=750.0, Fc=1.5, Fs=n["Fs"], vs=0.2, Fv=0.1, tau=n["tau"], gamma=2.0)
+        params = {"m": n["m"], "k": n["k"], "v": 0.0}
+        scene = jms.Scene(pulled, params, (jms.Friction(law, belt_velocity=n["belt"]),))
+        start = jnp.asarray([n["q0"]]), jnp.asarray([n["qd0"]])
+        return jms.simulate(scene, *start, 1.0, rtol=rtol, atol=atol).q[-1, 0]
 
-    x, run = jnp.array(numbers), jax.jit(end)
+    x, run = jnp.array([at[name] for name in varied]), jax.jit(end)
     wanted = gradient_by_differences(lambda x: run(x, 1e-11, 1e-13), x, 1e-3)
     np.testing.assert_allclose(jax.jit(jax.grad(end))(x, 1e-6, 1e-9), wanted, rtol=1e-4)
 

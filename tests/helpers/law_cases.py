@@ -73,9 +73,8 @@ def elements(law: Any, share: Any) -> Any:
 def contact(law: Any, share: Any) -> Any:
     """State of Armstrong's law, part of the stiction back."""
     rise = jnp.asarray(0.6, law.Fc.dtype)
-    return ArmstrongState(
-        share * (law.Fc + (law.Fs - law.Fc) * rise) / law.sigma0, rise, 0.8 + 0.0 * rise, 0.9 * law._turn() + 0.0 * rise
-    )
+    deflection = share * (law.Fc + (law.Fs - law.Fc) * rise) / law.sigma0
+    return ArmstrongState(deflection, rise, 0.8 + 0.0 * rise, 0.9 * 0.02 * law.Fc / law.sigma0 + 0.0 * rise)
 
 
 def deflection(law: Any, share: Any) -> Any:
