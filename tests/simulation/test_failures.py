@@ -62,6 +62,19 @@ def test_parameter_out_of_range_inside_jit() -> None:
         compiled(jnp.array(1.8))
 
 
+@pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd, lambda f: jax.vmap(jax.grad(f))])
+def test_a_derivative_alone_raises_the_error_of_its_run(derivative: Any) -> None:
+    """The program of a derivative that needs no value of the run has the check, too."""
+
+    def end(Fs: Any) -> Any:
+        scene = problems.ramped_box.scene(problems.ramped_box.lugre(Fs=Fs))
+        return jms.simulate(scene, [0.0], [0.0], 10.0, max_steps=30).q[-1, 0]
+
+    compiled = eqx.filter_jit(derivative(end))
+    with pytest.raises(eqx.EquinoxRuntimeError, match="step limit was reached"):
+        compiled(jnp.array(1.75) if derivative in (jax.grad, jax.jacfwd) else jnp.array([1.75, 1.8]))
+
+
 def root(t: Any, q: Any, qd: Any, p: Any) -> Any:
     """A force that stops being real once q has passed one."""
     del t
