@@ -231,7 +231,8 @@ class AbstractScalars(abc.ABC):
     def apply(self, compute: Callable[..., Value], name: str, params: Params, operands: list[Value]) -> Value:
         """One scalar by an operation on scalars, or a known or equal one."""
         if all(map(is_constant, operands)) and name in _KNOWN:
-            return np.asarray(_KNOWN[name](params, *operands))[()]
+            with np.errstate(all="ignore"):  # overflow and NaN without a word, as in JAX
+                return np.asarray(_KNOWN[name](params, *operands))[()]
         short = _shorten(name, operands)
         if short is not None:
             return short

@@ -97,7 +97,7 @@ def energy_audit(run: Trajectory) -> EnergyAudit:
     1.4250 J from the belt, 1.3169 J dissipated
     ```
     """
-    book, losses = run.ledger, run.event_losses
+    book = run.ledger
     return EnergyAudit(
         run.t,
         book.kinetic,
@@ -105,8 +105,8 @@ def energy_audit(run: Trajectory) -> EnergyAudit:
         book.stored,
         book.supplied,
         book.dissipated,
-        losses,
-        book.balance + losses,
+        book.lost,
+        book.balance,
     )
 
 

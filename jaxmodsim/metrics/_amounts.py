@@ -1,6 +1,5 @@
 """Metrics that are amounts: peaks, final values, dissipated energy."""
 
-import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..simulation import Trajectory, named_series, named_unit, peak_of
@@ -11,13 +10,13 @@ def peak(of: str) -> Metric:
     """Largest magnitude of a coordinate, velocity or force in a run.
 
     The peak is taken from t0 to the end, between saved times too, which needs two more runs of the scene. The first run
-    finds the eight steps with the largest candidates. The second samples each of these at 16 times and fits a parabola.
+    finds the eight steps with the largest candidates. The second interpolates each of these through 16 samples.
     In a scene with events the values just before and after each event count too, from the run of `run.events`.
 
-    The error is that of the dense output, plus up to 1e-6 of the peak if a step is a radian of the fastest motion. If
-    more than eight peaks differ by less than about 1e-3 of the amplitude, the result may be any of them. Derivatives
-    are taken at the fixed time of a smooth peak, where the series is stationary, along the event of a corner, or at
-    the end of the run if the peak is there and the end is a saved time.
+    The error is that of the dense output where the series is smooth within a step. If more than eight peaks differ by
+    less than about 1e-3 of the amplitude, the result may be any of them. Derivatives are taken at the fixed time of a
+    smooth peak, where the series is stationary, along the event of a corner, or at the end of the run if the peak is
+    there and the end is a saved time.
 
     **Arguments:**
 
@@ -87,7 +86,7 @@ def dissipated(effect: str | None = None) -> Metric:
 
     **Arguments:**
 
-    - `effect`: name of a dissipative effect; None for the sum of all.
+    - `effect`: name of a dissipative effect; None for the sum of all, and of the losses in impacts.
 
     **Returns:**
 
@@ -113,9 +112,9 @@ def dissipated(effect: str | None = None) -> Metric:
 
 
 def _dissipated(run: Trajectory, effect: str | None) -> Array:
-    lost = run.ledger.dissipated
     if effect is None:
-        return sum((each[-1] for each in lost.values()), jnp.zeros_like(run.t[-1]))
+        return run.energy.dissipated[-1]
+    lost = run.ledger.dissipated
     if effect not in lost:
         raise ValueError(f"{effect!r} dissipates no energy; dissipative effects are: {', '.join(lost) or 'none'}.")
     return lost[effect][-1]

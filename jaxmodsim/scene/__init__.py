@@ -10,6 +10,7 @@ from ._dynamics import from_dynamics as from_dynamics
 from ._dynamics import state_names as state_names
 from ._dynamics import vector_field as vector_field
 from ._event_driven import mode_numbers as mode_numbers
+from ._impact import impact_work as impact_work
 from ._implicit import check_step as check_step
 from ._implicit import compensating_force as compensating_force
 from ._implicit import scene_step as scene_step

@@ -18,9 +18,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._core.arrays import PerDof, Scalar
-from .._core.cholesky import factor_positive_definite, solve_semidefinite, solve_shifted
+from .._core.cholesky import factor_positive_definite, solve_balanced, solve_semidefinite, solve_shifted
 from .._core.lu import factor_matrix
-from ..mechanics import LinearizedConstraints, Poisson, linearize_constraints, motion_equations
+from ..mechanics import LinearizedConstraints, Poisson, linearize_constraints, motion_equations, parts, rates
 from ._scene import Scene
 
 # A gap or a slip has no velocity below this number of rounding units of the velocities of all coordinates.
@@ -115,6 +115,41 @@ def impact(
         jnp.where(closes, 1.0, none),
         jnp.asarray([of_each.get(name, False) for name in scene.event_driven], bool),
     )
+
+
+def impact_work(
+    t: Scalar, q: PerDof, qd: PerDof, after: PerDof, scene: Scene, mode: Float[Array, " modes"]
+) -> dict[str, Scalar]:
+    """Work of moving surfaces in an impact.
+
+    Constraints, gaps and slips have the velocities `J qd + c`, in which c is the motion of walls and belts. The
+    impulses p satisfy `J M^-1 J^T p = J (after - qd)`, so the surfaces do the work `-p c`.
+
+    **Arguments:**
+
+    - `t`, `q`, `scene`: the instant; the scene is that of time `t`.
+    - `qd`, `after`: velocities before and after it.
+    - `mode`: modes in which the contacts that touch are closed.
+
+    **Returns:**
+
+    The work [J] by the names of constraints and of friction elements.
+    """
+    closed = dict(zip(scene.contacts, scene.split_modes(mode)[1], strict=True))
+    held, params = scene.constraints_in(mode), scene.params
+    rubbing = [(closed[each.load_constraint or ""], each) for each in scene.impact_friction.values()]
+
+    def velocities(qd: PerDof) -> Float[Array, " k"]:
+        slips = [jnp.reshape(loaded * each.slip(t, q, qd, params), (1,)) for loaded, each in rubbing]
+        return jnp.concatenate([rates(held, t, q, params)(qd), *slips])
+
+    rows, c = jax.jacfwd(velocities)(qd), velocities(jnp.zeros_like(qd))
+    mass = motion_equations(scene.lagrangian, t, q, qd, params).mass
+    matrix = jnp.sum(rows[:, :, None] * factor_positive_definite(mass)(rows.T)[None, :, :], axis=1)
+    work = -c * solve_balanced(matrix, jnp.sum(rows * (after - qd)[None, :], axis=1))
+    of_constraints = [jnp.sum(work[part]) for part in parts(held, t, q, qd, params)]
+    of_friction = work[len(c) - len(rubbing) :]
+    return dict(zip((*scene.constraint_names, *scene.impact_friction), (*of_constraints, *of_friction), strict=True))
 
 
 def _struck(

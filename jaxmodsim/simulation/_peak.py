@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._core.arrays import is_known
@@ -11,11 +12,16 @@ from ._trajectory import Trajectory, trajectory
 
 # Number of steps with the largest estimates that are searched for the peak, and of samples in each of them.
 _INTERVALS, _SAMPLES = 8, 16
+# The samples of a step are at Chebyshev's points, -cos(angle) on [-1, 1]: their interpolant is as accurate as the dense
+# output, also at the ends. Its largest value is sought at the angles of a finer grid.
+_ANGLES = (np.arange(_SAMPLES) + 0.5) * np.pi / _SAMPLES
+_GRID = np.linspace(0.0, np.pi, 8 * _SAMPLES + 1)
 # Relative difference up to which a peak at the end of a step counts as that of an event or of a saved time, whose times
 # have derivatives. A turning point within a step has its derivative at its own time: a saved time close by does not.
 _CORNER = 1e-6
-# Third difference of four samples, in parts of their range, above which they jump; a smooth peak has a far smaller one.
-_JUMP = 0.5
+# Sum of the last four coefficients, in parts of the range of the samples, above which the series jumps in the step. The
+# coefficients of a jump fall as 1/k; those of a smooth series are far smaller.
+_JUMP = 0.05
 
 
 def peak_of(run: Trajectory, name: str) -> Float[Array, ""]:
@@ -53,7 +59,7 @@ def _between(run: Trajectory, name: str) -> tuple[Float[Array, ""], Bool[Array, 
     within = jnp.isfinite(length)
     start, length = jnp.where(within, start, run.t_end), jnp.where(within, length, 0.0)
     # Open intervals, as an event may have changed the series at their ends.
-    share = (jnp.arange(_SAMPLES, dtype=start.dtype) + 0.5) / _SAMPLES
+    share = jnp.asarray(0.5 - 0.5 * np.cos(_ANGLES), start.dtype)
     ts = start[:, None] + share[None, :] * length[:, None]
     ts = jnp.clip(jax.lax.stop_gradient(ts), plain.t0, run.t_end)
     near = plain._replace(ts=jnp.ravel(ts))
@@ -101,21 +107,22 @@ def _turns(step: Float[Array, " steps"], x: Float[Array, " nodes"], v: Float[Arr
 def _vertex(x: Float[Array, " samples"]) -> tuple[Float[Array, ""], Bool[Array, ""]]:
     """Largest magnitude within a step, and whether it is a turning point rather than an end of the step.
 
-    It lies on the parabola through the largest sample and its neighbours. Its position there is a constant: the series
-    is stationary, or the step ends. Beside a jump it is the largest sample: a step contains one if it begins before an
-    event and ends behind it.
+    It is that of the interpolant of the samples. Its time is a constant: the series is stationary there, or the step
+    ends. Beside a jump it is the largest sample: a step contains one if it begins before an event and ends behind it.
     """
-    fixed = jax.lax.stop_gradient(x)
-    at = jnp.argmax(jnp.abs(fixed))
-    j = jnp.clip(at, 1, _SAMPLES - 2)
-    four = jax.lax.dynamic_slice(fixed, (jnp.clip(j - 1, 0, _SAMPLES - 4),), (4,))
-    jumps = jnp.abs(jnp.diff(four, 3)[0]) > _JUMP * (jnp.max(four) - jnp.min(four))
-    y = jax.lax.dynamic_slice(x, (j - 1,), (3,)) * jnp.sign(fixed[j])
-    before, here, after = jax.lax.stop_gradient(y)
-    bend = before - 2.0 * here + after
-    vertex = 0.5 * (before - after) / jnp.where(bend < 0, bend, -1.0)
-    # Up to the ends of the step, half a sample beyond the outer ones; without a vertex the largest sample.
-    least, most = jnp.where(j == 1, -1.5, -1.0), jnp.where(j == _SAMPLES - 2, 1.5, 1.0)
-    d = jnp.clip(jnp.where(bend < 0, vertex, jnp.sign(after - before) * most), least, most)
-    highest = 0.5 * d * (d - 1.0) * y[0] + (1.0 - d**2) * y[1] + 0.5 * d * (d + 1.0) * y[2]
-    return jnp.where(jumps, jnp.abs(x[at]), highest), ~jumps & (bend < 0) & (d == vertex)
+    wave = np.cos(np.outer(np.arange(_SAMPLES), _ANGLES)) * 2.0 / _SAMPLES
+    wave[0] /= 2.0
+    c = jnp.sum(jnp.asarray(wave, x.dtype) * x[None, :], axis=1)
+    fixed, still = jax.lax.stop_gradient(x), jax.lax.stop_gradient(c)
+    jumps = jnp.sum(jnp.abs(still[-4:])) > _JUMP * (jnp.max(fixed) - jnp.min(fixed))
+    k, last = np.arange(_SAMPLES), len(_GRID) - 1
+    grid = jnp.asarray(np.cos(np.outer(_GRID, k)), x.dtype)
+    at = jnp.argmax(jnp.abs(jnp.sum(grid * still[None, :], axis=1)))
+    spacing = np.pi / last
+    angle = begun = jnp.asarray(at * spacing, x.dtype)
+    for _ in range(2):  # Newton steps to the stationary point; in the angle both ends of the step are such points
+        slope, bend = jnp.sum(k * jnp.sin(k * angle) * still), jnp.sum(k**2 * jnp.cos(k * angle) * still)
+        newton = angle - jnp.where(bend == 0, 0.0, slope / jnp.where(bend == 0, 1.0, bend))
+        angle = jnp.clip(newton, begun - spacing, begun + spacing)
+    top = jnp.abs(jnp.sum(jnp.cos(k * angle) * c))
+    return jnp.where(jumps, jnp.abs(x[jnp.argmax(jnp.abs(fixed))]), top), ~jumps & (at > 0) & (at < last)

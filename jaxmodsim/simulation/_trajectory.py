@@ -22,7 +22,7 @@ from ..scene import ConstraintReaction, Scene, State, forward_dynamics, mode_num
 from ..solvers import EventLog
 from ._accuracy import Accuracy
 from ._columns import ByName, Columns, columns
-from ._energy_ledger import EnergyLedger, event_losses, ledger
+from ._energy_ledger import EnergyLedger, at_events, ledger
 from ._integrated_system import Series, Work
 from ._outcome import SUCCESS, RunResult, SimulationError, outcome_messages
 from ._run_request import RunRequest
@@ -95,8 +95,8 @@ class Energy(AbstractReadable):
     - `stored`: energy in the states of friction laws (bristles).
     - `work_in`: energy supplied since t0 by applied forces, belts, moving constraints, and explicit time dependence of
       the Lagrangian.
-    - `dissipated`: energy lost in friction since t0. For dynamic laws with a `normal_force` the energy in the state
-      counts as lost until it returns, because with a variable load it is no function of the state.
+    - `dissipated`: energy lost since t0 in friction and impacts. For dynamic laws with a `normal_force` the energy in
+      the state counts as lost until it returns, because with a variable load it is no function of the state.
     - `balance`: kinetic + potential + stored + dissipated - work_in, less its value at t0: the error of the
       integration.
     """
@@ -287,13 +287,18 @@ class Trajectory(AbstractReadable):
         `jaxmodsim.energy_audit` sums them.
         """
         self._one_run("ledger")
-        return self._once("ledger", lambda: ledger(self.request, self.t, self._states(), self._audited()[0]))
+        return self._once("ledger", self._booked)
 
     @property
     def event_losses(self) -> Float[Array, " time"]:
-        """Energy [J] lost since t0 at events; repeats the run as `events`."""
+        """Energy [J] lost since t0 at events; repeats the run as `events`.
+
+        An impact on a surface that moves loses what the surface supplies, less the gain in energy: the loss is the same
+        for observers at rest and in motion.
+        """
         self._one_run("event_losses")
-        return self._lost(None if self.modes is None else self._log())
+        log = self._log() if self.scene.contacts else None
+        return at_events(self.request, self.t, solve_start(self.request), log)[0]
 
     @property
     def energy(self) -> Energy:
@@ -303,8 +308,7 @@ class Trajectory(AbstractReadable):
         stored, supplied, dissipated = (
             sum(each.values(), zero) for each in (book.stored, book.supplied, book.dissipated)
         )
-        lost = self._lost(self._audited()[1]) if self.scene.contacts else zero
-        return Energy(book.kinetic, book.potential, stored, supplied, dissipated + lost, book.balance + lost)
+        return Energy(book.kinetic, book.potential, stored, supplied, dissipated + book.lost, book.balance)
 
     @property
     def columns(self) -> Columns:
@@ -369,8 +373,9 @@ class Trajectory(AbstractReadable):
         assert again.work is not None
         return again.work, again.log
 
-    def _lost(self, log: EventLog | None) -> Float[Array, " time"]:
-        return event_losses(self.request, self.t, solve_start(self.request), log)
+    def _booked(self) -> EnergyLedger:
+        work, log = self._audited()
+        return ledger(self.request, self.t, self._states(), work, solve_start(self.request), log)
 
     def _once(self, name: str, make: Callable[[], _Value]) -> _Value:
         """A value from a repeat of the run, made once."""

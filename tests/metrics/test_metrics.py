@@ -289,6 +289,31 @@ def test_the_peak_of_a_force_that_jumps_is_within_its_limits() -> None:
     np.testing.assert_allclose(peak(belts), 2.0, rtol=1e-5)
 
 
+def test_the_peak_at_the_end_of_a_step_is_that_of_its_event() -> None:
+    """A mass on a spring strikes a wall at its largest speed, or starts with it; w = sqrt(k/m)."""
+    rng = np.random.default_rng(5)
+    a = rng.uniform(0.2, 1.0, 24)
+    numbers = np.stack([rng.uniform(0.5, 2.0, 24), rng.uniform(5.0, 50.0, 24), a, rng.uniform(0.1, 0.9, 24) * a], 1)
+
+    def lagrangian(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del t
+        return 0.5 * p["m"] * qd[0] ** 2 - 0.5 * p["k"] * q[0] ** 2
+
+    def peak(x: Any, struck: bool) -> Any:
+        m, k, a, d = x
+        wall = jms.Contact(lambda t, q, p: -p["d"] - q[0], restitution=0.5)
+        scene = jms.Scene(lagrangian, {"m": m, "k": k, "d": d}, constraints=(wall,))
+        fast = jnp.sqrt(k / m * (a**2 - d**2))
+        start = (-a[None], [0.0]) if struck else (-d[None], -fast[None])
+        return metrics.peak("qd[0]")(jms.simulate(scene, *start, 1.0 if struck else 0.1 * jnp.sqrt(m / k)))
+
+    for struck in (True, False):
+        value, slope = jax.jit(jax.vmap(jax.value_and_grad(lambda x, struck=struck: peak(x, struck))))(numbers)
+        exact = jax.vmap(jax.value_and_grad(lambda x: jnp.sqrt(x[1] / x[0] * (x[2] ** 2 - x[3] ** 2))))(numbers)
+        np.testing.assert_allclose(value, exact[0], rtol=1e-6)
+        np.testing.assert_allclose(slope, exact[1], rtol=2e-5)
+
+
 def test_of_equal_peaks_one_has_the_derivative():
     @jax.jit
     @jax.grad

@@ -54,6 +54,37 @@ def test_an_oblique_impact_of_a_disc(law):
     np.testing.assert_allclose(slope, -1.8 * speed / J, rtol=1e-9)
 
 
+@pytest.mark.parametrize("mu", [0.1, 1.0])
+def test_an_observer_in_motion_sees_the_same_loss(mu):
+    """A disc strikes a floor and a belt, held by a rail; from a frame in motion, in which floor, belt and rail move."""
+
+    def seen(vx, vz):
+        """From a frame whose velocity is (-vx, -vz): the rail holds the height less half of the angle."""
+        friction = jms.Friction(jms.Coulomb(mu), along=_foot, normal_force="floor", belt_velocity=0.4 + vx)
+        scene = jms.Scene(
+            _kinetic,
+            params={"vz": vz},
+            effects=(friction,),
+            constraints=(
+                jms.Contact(lambda t, q, p: q[1] - p["vz"] * t, restitution=0.8, name="floor"),
+                jms.Constraint(lambda t, q, p: q[1] - p["vz"] * t - 0.5 * q[2] - 1.0, name="rail"),
+            ),
+        )
+        return jms.simulate(scene, [0.0, 1.0, 0.0], [1.0 + vx, vz - 2.0, -4.0], 1.0, rtol=1e-10, atol=1e-12)
+
+    still, moving = seen(0.0, 0.0), seen(0.7, -0.3)
+    np.testing.assert_allclose(moving.qd[-1] - still.qd[-1], [0.7, -0.3, 0.0], atol=1e-10)
+    np.testing.assert_allclose(moving.event_losses, still.event_losses, rtol=1e-10)
+    assert abs(still.event_losses[-1]) > 0.1
+    work = jms.energy_audit(moving).work
+    np.testing.assert_allclose(jms.energy_audit(still).work["floor"], 0.0, atol=1e-10)
+    # The floor and the rail move alike, so together they do the work of the impulse that turns the disc up.
+    gained = -0.3 * (moving.qd[-1, 1] - (-0.3 - 2.0))
+    np.testing.assert_allclose(work["floor"] + work["rail"], gained, rtol=1e-10)
+    np.testing.assert_allclose(work["friction"], (0.4 + 0.7) * (moving.qd[-1, 0] - 1.7), rtol=1e-10)
+    np.testing.assert_allclose(moving.energy.balance, 0.0, atol=1e-10)
+
+
 def test_friction_of_an_impact_may_depend_on_where_it_happens():
     """The coefficient of `scaled_by` is that of the place and the parameters at the instant of the impact."""
     law = jms.scaled_by(jms.Coulomb(0.05), lambda t, q, qd, p: p["wear"] * (1.0 + q[0]))

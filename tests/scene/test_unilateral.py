@@ -404,6 +404,29 @@ def test_the_loss_of_an_impact_is_in_the_balance_at_a_saved_time_within_rounding
     np.testing.assert_allclose(early.event_losses, [0.0, 0.375, 0.375, 0.375], atol=1e-12)
 
 
+@pytest.mark.parametrize("law", [lambda e: e, jms.Poisson])
+@pytest.mark.parametrize("e", [0.0, 0.6, 1.0])
+def test_the_loss_of_an_impact_on_a_wall_that_moves_is_that_of_the_relative_motion(e, law):
+    """The wall does the work that its impulse does at its velocity; a perfectly elastic blow loses nothing."""
+    m, v, wall = 2.0, -1.5, 0.5
+    scene = jms.Scene(
+        _ball,
+        params={"m": m, "g": 0.0, "rise": wall},
+        constraints=(jms.Contact(_over_a_rising_floor, restitution=law(e), name="wall"),),
+    )
+    run = jms.simulate(scene, [0.1], [v], 1.0, ts=np.array([0.01, 1.0]), **TIGHT)
+    after = wall + e * (wall - v)
+    np.testing.assert_allclose(run.qd[-1, 0], after, rtol=1e-12)
+    lost, work = 0.5 * m * (1 - e**2) * (wall - v) ** 2, m * (after - v) * wall
+    np.testing.assert_allclose(run.event_losses, [0.0, lost], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(run.energy.dissipated, [0.0, lost], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(run.energy.work_in, [0.0, work], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(run.energy.balance, 0.0, atol=1e-12)
+    audit = jms.energy_audit(run)
+    np.testing.assert_allclose([audit.work["wall"][-1], audit.event_losses[-1]], [work, lost], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(jms.metrics.dissipated()(run), lost, rtol=1e-12, atol=1e-12)
+
+
 def test_a_saved_time_and_an_end_at_an_impact_hold_the_state_after_it():
     """At the default tolerances, at impacts of the closed form and at those that a run has noted."""
     for h, e in ((1.0, 0.5), (0.37, 0.8), (20.0, 0.3)):
