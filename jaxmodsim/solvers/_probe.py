@@ -20,7 +20,8 @@ from .events._state import EventState
 # Change in a number that is zero, which has no magnitude.
 _OF_ZERO = 1e-3
 # Admissible error of the tangent at rest, in parts of `rtol`; the factor by which it is larger in motion, where the
-# error of the state limits the steps, too; the error of the state in motion, in parts of its tolerance.
+# error of the state limits the steps, too, but not in brief contacts; the error of the state in motion, in parts of its
+# tolerance.
 _AT_REST, _IN_MOTION, _MOVES = 0.1, 150.0, 0.01
 # Least magnitude of a tangent, in parts of the largest in its array.
 _OF_ARRAY = 1e-3
@@ -42,9 +43,9 @@ _SHORT, _OVER_A_KINK = 8.0, 32.0
 class ProbeTangent(NamedTuple):
     """The tangents of the state and of the solver's state, and the magnitudes of the former so far.
 
-    Errors are relative to the magnitudes: the largest values, or, with `elapsed`, means over this time since the start.
-    Through a stiff contact a tangent moves as the force does, thousands of times larger than behind it, and parts
-    cancel. An error that is small beside the peak would be most of what remains.
+    Errors are relative to the magnitudes: the largest values, or, with `elapsed`, squares of the mean root over this
+    time since the start. Through a stiff contact a tangent moves as the force does, thousands of times larger than
+    behind it, and parts cancel. An error that is small beside the peak would be most of what remains.
     """
 
     tangent: tuple[PyTree, PyTree]
@@ -136,7 +137,10 @@ class ProbedStep(NamedTuple):
             magnitude = jtu.tree_map(jnp.maximum, now, probe.magnitude)
         else:
             elapsed = elapsed + h
-            magnitude = jtu.tree_map(lambda d, x: x + h / elapsed * (d - x), now, probe.magnitude)
+            part = h / elapsed
+            magnitude = jtu.tree_map(
+                lambda d, x: jnp.square((1.0 - part) * jnp.sqrt(x) + part * jnp.sqrt(d)), now, probe.magnitude
+            )
         ends = jtu.tree_map(lambda a, b: jnp.maximum(jnp.abs(a), jnp.abs(b)), _integrated(held), _integrated(y1))
         late = jnp.maximum(h, _LATE * probe.length)
 
@@ -145,24 +149,29 @@ class ProbedStep(NamedTuple):
             return jnp.where(before < _OF_ARRAY * soon, jnp.maximum(magnitude, soon), magnitude)
 
         scales = jtu.tree_map(scale, magnitude, probe.magnitude, _integrated(probe.tangent[0]), _integrated(tangent[0]))
-        errors = jnp.where(probe.counts > 0, self._size((t0, t1), error, error_of_probe, scales, ends), 0.0)
+        errors = jnp.where(
+            probe.counts > 0, self._size((t0, t1), error, error_of_probe, scales, ends, elapsed is not None), 0.0
+        )
         after = ProbeTangent(tangent, magnitude, elapsed, late, jnp.ones_like(probe.counts))
         return Probed(y1, after), (error, errors), dense, state1, result
 
-    def _size(self, times: tuple[Array, Array], error: PyTree, of_probe: PyTree, magnitude: PyTree, y: PyTree) -> Array:
+    def _size(
+        self, times: tuple[Array, Array], error: PyTree, of_probe: PyTree, magnitude: PyTree, y: PyTree, brief: bool
+    ) -> Array:
         """Size of the probe's error in parts of its tolerance."""
         control = _pid(self.controller)[0]
         rtol, atol = lax.stop_gradient((control.rtol, control.atol))
         (t0, t1), dtmin = times, 0.0 if control.dtmin is None else control.dtmin
         shortest = jnp.maximum(dtmin, float(jnp.finfo(t0.dtype).eps) * jnp.maximum(jnp.abs(t0), jnp.abs(t1)))
         short = lax.stop_gradient(t1 - t0 < _SHORT * shortest)
+        more = 0.0 if brief else _IN_MOTION - 1.0
 
         def size(of_state: Array, of_tangent: Array, magnitude: Array, y: Array) -> Array:
             of_state, tolerance = jnp.abs(of_state), atol + rtol * y
             moves = jnp.minimum(1.0, of_state / (_MOVES * tolerance))
             eps = float(jnp.finfo(y.dtype).eps)
             resolved = jnp.where(short, _OVER_A_KINK * eps**0.5, _RESOLVED * eps)
-            relative = jnp.maximum(_AT_REST * (1.0 + (_IN_MOTION - 1.0) * moves) * rtol, resolved)
+            relative = jnp.maximum(_AT_REST * (1.0 + more * moves) * rtol, resolved)
             tangent = jnp.maximum(magnitude, _OF_ARRAY * jnp.max(magnitude))
             noise = _OF_ATOL * atol + _ROUNDINGS * eps * y
             noise = noise + jnp.minimum(_OF_ERROR * of_state, _OF_TOLERANCE * tolerance)

@@ -342,6 +342,24 @@ def test_derivatives_through_a_compliant_contact(derivative, rtol, error):
             assert abs(found[name] - right[name]) * x < error, (stiffness, name)
 
 
+def test_derivatives_of_random_rebounds():
+    """By mass, stiffness, damping and speed, from 1e4 to 1e12 N/m^1.5, in free flight, against the closed form."""
+    rng = np.random.default_rng(2)
+    numbers = np.stack([rng.uniform(0.2, 3.0, 32), 10.0 ** rng.uniform(4, 12, 32), rng.uniform(0.0, 0.5, 32)], 1)
+    numbers = np.concatenate([numbers, rng.uniform(0.5, 5.0, (32, 1))], axis=1)
+
+    def after(x):
+        scene = _compliant_ball(jms.HuntCrossley(x[1], damping=x[2]), m=x[0], g=0.0)
+        return jms.simulate(scene, [0.1], -x[3:], 1.0, throw=False).qd[-1, 0]
+
+    slopes = jax.jit(jax.vmap(jax.jacfwd(after)))(numbers)
+    exact = jax.vmap(jax.jacfwd(lambda x: jms.HuntCrossley(x[1], damping=x[2]).restitution(x[3]) * x[3]))(numbers)
+    size = np.max(np.abs(exact * numbers), axis=1)
+    errors = np.max(np.abs(slopes - exact) * numbers, axis=1) / size
+    assert np.median(errors) < 1e-5
+    assert np.max(errors) < 5e-3
+
+
 def test_a_compliant_contact_becomes_rigid_as_its_stiffness_grows():
     """It lasts as long as depth over speed, and the depth is `(m v^2/k)^(1/(n + 1))`: order 2/5 for n = 3/2."""
     law = jms.HuntCrossley(1.0, damping=0.2)
