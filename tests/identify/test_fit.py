@@ -14,7 +14,7 @@ from jaxmodsim.identify.model._parameters import FreeParameters
 from jaxmodsim.identify.uncertainty._estimate import BLOCKS, covariance_estimate
 from jaxmodsim.scene import replace_numbers, scene_numbers, scene_ranges
 
-from ..helpers.sprung import lagrangian, sprung
+from ..helpers.sprung import lagrangian, sprung, sprung_mass
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 DT = 2e-3
@@ -375,6 +375,35 @@ def test_a_step_too_long_for_the_friction_is_warned(clean):
     assert result.diagnostics.step_error is not None
     assert result.diagnostics.step_error > 0.1 * result.rmse
     assert any("Raise substeps" in warning for warning in warnings_for(result))
+
+
+@pytest.mark.parametrize("channels", [("x",), ("x", "v")])
+def test_a_step_that_moves_a_parameter_is_warned_however_small_it_is(channels):
+    # The exact motion of a mass on a damped spring; the error of the step is less than a tenth of the noise.
+    rng, m, k, Fv = np.random.default_rng(2), 2.0, 20.0, 0.04
+    t = np.linspace(0.0, 100.0, 5001)
+    root = -Fv / (2 * m) + 1j * np.sqrt(k / m - (Fv / (2 * m)) ** 2)
+    turn = np.exp(root * t) / root.imag
+    exact = {"x": -np.imag(np.conj(root) * turn), "v": -k / m * turn.imag}
+    noise = {"x": 0.015, "v": 0.05}
+    measured = {name: exact[name] + noise[name] * rng.standard_normal(t.size) for name in channels}
+    scene = sprung_mass(jms.Friction(jms.Viscous(0.05)), m=m, k=20.1)
+    observe = {name: {"x": "q[0]", "v": "qd[0]"}[name] for name in channels}
+    coarse, fine = (
+        jms.fit(
+            scene, jms.Record(t, measured), ("k", "friction.Fv"), observe=observe, q0=[1.0], qd0=[0.0], substeps=each
+        )
+        for each in (1, 4)
+    )
+    error = coarse.diagnostics.step_error
+    assert error is None or error < 0.1 * coarse.rmse
+    said = [warning for warning in warnings_for(coarse) if "Raise substeps" in warning]
+    assert len(said) == 1
+    moved = abs(fine.values["friction.Fv"] - coarse.values["friction.Fv"]) / coarse.errors["friction.Fv"]
+    assert moved > 1.0
+    assert float(said[0].split("friction.Fv moves by ")[1].split()[0]) == pytest.approx(moved, rel=0.1)
+    assert not any("Raise substeps" in warning for warning in warnings_for(fine))
+    assert abs(fine.values["friction.Fv"] - Fv) < 4.5 * fine.errors["friction.Fv"]
 
 
 @pytest.mark.parametrize(

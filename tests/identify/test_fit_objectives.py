@@ -200,6 +200,26 @@ def test_outliers_do_not_pull_a_robust_fit(full):
     assert off[1] < 0.1 * off[0]
 
 
+@pytest.mark.parametrize("loss", [Huber(), Huber(0.5), Cauchy(), Cauchy(1.0)])
+def test_standard_errors_of_a_robust_fit_are_those_of_its_estimator(loss):
+    # With the influence psi of the loss, the variance is that of least squares times E[psi^2]/E[psi']^2 (Huber 1964).
+    k, r = float(loss.limit), np.linspace(-10.0, 10.0, 20001)
+    huber = isinstance(loss, Huber)
+    psi = np.clip(r, -k, k) if huber else r / (1 + (r / k) ** 2)
+    slope = (np.abs(r) < k) if huber else (1 - (r / k) ** 2) / (1 + (r / k) ** 2) ** 2
+    normal = np.exp(-(r**2) / 2) / np.sqrt(2 * np.pi) * 1e-3
+    factor = np.sqrt(np.sum(psi**2 * normal)) / np.sum(slope * normal)
+    t = np.linspace(0.0, 4.0, 2001)
+    x, ratios = np.sin(3.0 * t), []
+    v = np.diff(x) / np.diff(t)
+    for seed in range(10):
+        force = 2.0 * np.concatenate([[0.0], v]) + 0.1 * np.random.default_rng(seed).standard_normal(t.size)
+        result = jms.fit_law(jms.Viscous(1.0), jms.Record(t, force, {"x": x}), loss=loss)
+        ratios.append(result.errors["Fv"] / (factor * 0.1 / np.linalg.norm(v)))
+    # A standard error scatters by less than a fifth, so their mean by 6 %.
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.12)
+
+
 def test_windows_find_what_one_run_finds(full):
     one = jms.fit(sprung(1.8), only_x(full), tuple(TRUTH), q0=[0.0])
     several = jms.fit(sprung(1.8), only_x(full), tuple(TRUTH), q0=[0.0], shooting=MultipleShooting(0.3, (1e-5, 1e-3)))

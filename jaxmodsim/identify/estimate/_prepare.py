@@ -430,20 +430,26 @@ def _jump(shooting: MultipleShooting | None, windows: tuple[Window, ...], base: 
     return jnp.asarray([window.linked for window in windows[:-1]], float)[:, None] / flat[None, :]
 
 
-def step_error(search: SearchResult) -> float | None:
-    """Root mean square change of the output with four times as many integration steps.
-
-    None without such steps, or for several channels.
-    """
-    problem = search.problem
-    if not isinstance(problem.engine, ReplayEngine) or len(problem.noise) > 1:
-        return None
+def step_changes(search: SearchResult) -> dict[str, Float[np.ndarray, "runs samples"]]:
+    """Changes of the output by channel with four times as many integration steps; none without such steps."""
+    problem, changes = search.problem, {}
+    if not isinstance(problem.engine, ReplayEngine):
+        return changes
     finer = replace(problem.engine, substeps=_FINER * problem.engine.substeps)
     fine = channels_seen(eqx.tree_at(lambda p: p.engine, problem, finer), search.state.x)
-    name, weight = next((name, np.asarray(weight)) for name, weight in problem.columns.items())
-    coarse = np.asarray(search.state.residual)[: problem.samples].reshape(weight.shape) * float(problem.noise[name])
-    moved = np.asarray(fine[name]) - np.asarray(problem.runs.measured[name]) - coarse
-    return float(np.sqrt(np.sum(moved[weight > 0] ** 2) / np.sum(weight)))
+    for name, (residual, weight) in search.residuals.items():
+        coarse = residual * float(problem.noise[name])
+        moved = np.asarray(fine[name]) - np.asarray(problem.runs.measured[name]) - coarse
+        changes[name] = np.where(weight > 0, moved, 0.0)
+    return changes
+
+
+def step_error(search: SearchResult, changes: Mapping[str, Float[np.ndarray, "runs samples"]]) -> float | None:
+    """Root mean square of the `step_changes` of the one channel; None without such steps, or for several channels."""
+    if len(changes) != 1:
+        return None
+    ((name, moved),) = changes.items()
+    return float(np.sqrt(np.sum(moved**2) / np.sum(search.residuals[name][1])))
 
 
 def measured_start(record: Record, observables: Observables, dof: int) -> tuple[np.ndarray, np.ndarray]:

@@ -59,6 +59,14 @@ class AbstractLoss(AbstractRanged):
         weight = jnp.sqrt(jax.vmap(jax.grad(self.rho))(residual**2))
         return weight * residual, weight[:, None] * jacobian
 
+    @eqx.filter_jit
+    def influence(self, residual: Float[Array, " m"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+        """Half the derivative of the loss by the residual, and the derivative of that."""
+        first, second = jax.grad(self.rho), jax.grad(jax.grad(self.rho))
+        s = residual**2
+        weight = jax.vmap(first)(s)
+        return weight * residual, weight + 2.0 * s * jax.vmap(second)(s)
+
 
 class SquaredLoss(AbstractLoss):
     """Least squares: the maximum likelihood of normal noise."""

@@ -32,6 +32,8 @@ _ROUND = 100
 Progress: TypeAlias = Callable[[int, float, dict[str, float]], None]
 # Noise levels are estimated up to so many times, until they change by less than this share.
 _NOISE_ROUNDS, _NOISE_SETTLED = 6, 0.02
+# Least mean slope of the influence of a robust loss.
+_LEAST_SLOPE = 1e-3
 ENDINGS = {1: "converged", 2: "settled where the cost is no smoother than the steps of the model"}
 
 
@@ -249,11 +251,27 @@ def channels_seen(problem: FitProblem, x: Float[Array, " n"]) -> dict[str, Float
     return problem.seen(x).channels
 
 
-def weighted_by(loss: AbstractLoss, state: SearchState) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
-    """Residual and Jacobian of a search, weighted as `AbstractLoss.weighted` says."""
-    pair = state.residual, state.jacobian
-    residual, jacobian = loss.weighted(*pair) if loss.robust else pair
-    return np.asarray(residual), np.asarray(jacobian)
+def linearised(problem: FitProblem, state: SearchState) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
+    """Residual and Jacobian of a search, whose products are the scores and the curvature of the cost.
+
+    The curvature of a robust loss is the slope of its influence. The weights of the search are larger, as they bound
+    that slope. All samples of a channel have the mean slope (Huber 1981, Robust Statistics, section 7.6).
+    """
+    residual, jacobian = np.asarray(state.residual), np.asarray(state.jacobian)
+    if not problem.loss.robust:
+        return residual, jacobian
+    influence, slope = (np.asarray(each) for each in problem.loss.influence(state.residual))
+    means = []
+    for rows, weight in problem.by_channel(slope).values():
+        mean = float(np.mean(rows[weight > 0])) if np.any(weight > 0) else 1.0
+        means.append(np.full(weight.shape, max(mean, _LEAST_SLOPE)))
+    factor = np.sqrt(np.concatenate(means, axis=1).reshape(-1)).astype(residual.dtype)
+    rows = problem.samples
+    # A prior and the other rows that are no samples are not robust here.
+    return (
+        np.concatenate([influence[:rows] / factor, residual[rows:]]),
+        np.concatenate([jacobian[:rows] * factor[:, None], jacobian[rows:]]),
+    )
 
 
 def _rms(problem: FitProblem, state: SearchState) -> float:

@@ -11,7 +11,7 @@ from ..._core.arrays import on_device
 from ..._core.readable import AbstractReadable, Table, table_of
 from ..._core.system import jsonable
 from ..estimate._problem import AbstractLoss
-from ..estimate._search import SearchResult, weighted_by
+from ..estimate._search import SearchResult, linearised
 from ..uncertainty._estimate import in_unit_columns, sample_blocks
 from ..uncertainty._residual_tests import effective_samples
 from ..uncertainty._result import FitResult
@@ -52,7 +52,7 @@ def penalty(search: SearchResult) -> float:
     the record does not determine counts as one parameter.
     """
     rows = search.problem.samples
-    residual, jacobian = (each[:rows] for each in weighted_by(search.problem.loss, search.state))
+    residual, jacobian = (each[:rows] for each in linearised(search.problem, search.state))
     scaled, size = in_unit_columns(jacobian)
     values, vectors = np.linalg.eigh(scaled.T @ scaled)
     known = values > _LEAST * values[-1]

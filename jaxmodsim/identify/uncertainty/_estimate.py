@@ -1,7 +1,7 @@
 """Estimates with their covariance, for residuals of any size that may be correlated in time."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ from ..._core.arguments import as_share
 from ..._core.arrays import on_device
 from ..data._record import Record
 from ..estimate._problem import FitProblem
-from ..estimate._search import SearchState, state_at, weighted_by
+from ..estimate._search import SearchState, linearised, state_at
 from ..model._observe import RecordedMotion, motion_of
 
 # Blocks of samples: enough for the scatter of the scores of a dozen parameters, each much longer than the correlation
@@ -30,6 +30,8 @@ _BEYOND, _NO_PART = 4.0, 1e-8
 # residual is not white. Keeps divisions finite.
 _LAGS_A_DECADE, _SAMPLES_A_LAG = 10, 5
 _CHANCE, _TINY = 0.01, 1e-30
+# More integration steps are asked for where they move a parameter by this share of its standard error.
+_STEP_MOVES = 0.5
 # Derivatives are tested over this share of a standard error; their error must be below this share of the change.
 _TRIED, _HOLDS = 0.1, 0.5
 # Share of the largest information from which an axis is determined.
@@ -346,7 +348,7 @@ def covariance_of(
         return CovarianceEstimate(unknown, unknown, none, refused=True)
     numbers, count = sample_blocks(problem, blocks)
     rows, slopes = problem.samples, problem.slopes_at(state.x)
-    residual, jacobian = (each[:rows] for each in weighted_by(problem.loss, state))
+    residual, jacobian = (each[:rows] for each in linearised(problem, state))
     white = _passes_for_white(problem, residual)
     extra = np.asarray(state.jacobian)[rows:]
     order = np.array([*entries, *(k for k in range(slopes.shape[0]) if k not in set(entries))])
@@ -409,6 +411,40 @@ def offset_issues(
             )
             issues.append(IdentifiabilityIssue(sentence, ()))
     return tuple(issues)
+
+
+def step_issues(
+    problem: FitProblem,
+    state: SearchState,
+    entries: Sequence[int],
+    errors: Mapping[str, float],
+    changes: Mapping[str, Float[np.ndarray, "runs samples"]],
+) -> tuple[IdentifiabilityIssue, ...]:
+    """The parameter that more integration steps move farthest, if that is half of its standard error or more.
+
+    One Gauss-Newton step. A small error of the steps counts in long records, since it is the same in all of them.
+
+    **Arguments:**
+
+    - `entries`: entries of x whose parameters count. `errors`: their standard errors by name.
+    - `changes`: of the output with more steps, by channel.
+    """
+    if not changes or not all(np.isfinite(each).all() for each in changes.values()):
+        return ()
+    rows = [changes[name] / float(problem.noise[name]) for name in problem.columns]
+    scaled, size = in_unit_columns(np.asarray(state.jacobian, float))
+    moved = np.concatenate([np.concatenate(rows, axis=1).reshape(-1), np.zeros(problem.rows - problem.samples)])
+    step = -np.linalg.lstsq(scaled, moved, rcond=_NO_PART)[0] / size
+    far = np.abs(problem.slopes_at(state.x) @ step)[list(entries)]
+    known = {name: x / errors[name] for name, x in zip(errors, far.tolist(), strict=True) if errors[name] > 0}
+    name = max(known, key=lambda name: known[name], default="")
+    if not name or not known[name] > _STEP_MOVES:
+        return ()
+    sentence = (
+        f"The integration step shows: with four times as many, {name} moves by {known[name]:.2g} standard errors."
+        " Raise substeps."
+    )
+    return (IdentifiabilityIssue(sentence, ()),)
 
 
 def derivatives_hold(problem: FitProblem, state: SearchState) -> bool:

@@ -12,7 +12,7 @@ from scipy import special  # scipy.stats takes most of a second to import
 from ..._core.arguments import as_share, as_whole
 from ..._core.arrays import on_device
 from ..estimate._problem import FitProblem, Prior
-from ..estimate._search import SearchOptions, SearchResult, finished, solve, weighted_by
+from ..estimate._search import SearchOptions, SearchResult, finished, linearised, solve
 from ._estimate import BLOCKS, ROUNDING, ParameterEstimate, floored_inverse
 from ._fit import searched_on
 from ._result import FitResult
@@ -254,7 +254,7 @@ def _line_of(estimate: ParameterEstimate, search: SearchResult, name: str) -> tu
     i = problem.free.names.index(name)
     value, error = estimate.values[name], estimate.errors[name]
     slopes = problem.slopes_at(state.x)[i]
-    residual, jacobian = weighted_by(problem.loss, state)
+    residual, jacobian = linearised(problem, state)
     rounding = ROUNDING * float(np.finfo(jacobian.dtype).eps)
     sensitivity = floored_inverse(jacobian.astype(float).T @ jacobian, rounding) @ slopes
     by_losses = float(slopes @ sensitivity)

@@ -272,7 +272,12 @@ def is_step_size_limited(result: FitResult) -> bool:
 
     A `bool`.
     """
-    errors, change = list(result.diagnostics.rmse.values()), result.diagnostics.step_error
+    return step_shows(result.diagnostics.rmse, result.diagnostics.step_error)
+
+
+def step_shows(rmse: Mapping[str, float], change: float | None) -> bool:
+    """Whether the error of the integration step, if it is known, is large against the RMSE of the one channel."""
+    errors = list(rmse.values())
     return change is not None and len(errors) == 1 and change > _STEP_SHOWS * errors[0]
 
 
