@@ -26,7 +26,7 @@ APPLICATIONS = {
     "metrics": 633,
     "analysis": 2136,
     "orbits": 3122,
-    "identify": 9614,
+    "identify": 9629,
     "sweeps": 2093,
     "export": 1906,
     "control": 790,

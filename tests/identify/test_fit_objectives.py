@@ -189,6 +189,27 @@ def test_a_delay_of_a_fraction_of_a_sample_is_found(linear):
     assert result.estimate.units["delay.u"] == "s"
 
 
+@pytest.mark.parametrize("linear", [(), ("u",)])
+def test_more_steps_resolve_a_delay_of_a_fraction_of_a_sample(linear):
+    # The same input on a grid of which the delay is a whole number of intervals.
+    n, h, share = 120, 0.05, 0.4
+    t, fine = h * np.arange(n), h / 10 * np.arange(10 * n - 9)
+    u, scene, rest = 3.0 * np.sin(4.0 * t), sprung_mass(DRIVE, jms.Friction(jms.Viscous(0.6)), gain=1.0), jnp.zeros(1)
+    before = fine - share * h
+    held = u[np.maximum(np.floor(before / h + 1e-9), 0).astype(int)]
+    late = {"u": jnp.asarray(np.interp(before, t, u) if linear else held)}
+    look = lambda t, y, scene, mode: y.q[0]  # noqa: E731
+    y0 = State(rest, rest, scene.initial_state(rest))
+    exact, _ = run_samples(scene, jnp.asarray(fine), late, y0, look, linear=frozenset(linear))
+    data, errors = jms.Record(t, np.asarray(exact)[::10], {"u": u}, linear=linear), []
+    for substeps in (1, 5, 10):
+        chosen = options(observe="q[0]", q0=[0.0], qd0=[0.0], delay={"u": share * h}, substeps=substeps)
+        problem = prepare(scene, data, ("m",), chosen).problem
+        errors.append(float(jnp.max(jnp.abs(problem.seen(problem.x0).channels["measured"][0] - exact[::10]))))
+    assert errors[0] > 1e-3
+    assert max(errors[1:]) < 1e-2 * errors[0]
+
+
 def test_outliers_do_not_pull_a_robust_fit(full):
     spoilt = full.channels["x"].copy()
     spoilt[::20] += 0.02

@@ -312,19 +312,22 @@ class ReplayEngine(eqx.Module):
 
     def __call__(self, values: dict[str, Array], start: State, run: Runs) -> ModelOutput:
         """Run the scene with these values over the samples."""
-        scene = with_values(self.model, values)
-        inputs = delayed(run.t, run.inputs, self.linear, self.delays | values)
+        late, t, inputs, parts = self.delays | values, run.t, run.inputs, 1
+        if self.controller is None and any(DELAY + name in late for name in inputs):
+            # A delayed input changes between samples: each step has its own value.
+            parts = self.substeps
+            t, inputs = split_samples(t, inputs, self.linear, parts)
         seen, end = run_samples(
-            scene,
-            run.t,
-            inputs,
+            with_values(self.model, values),
+            t,
+            delayed(t, inputs, self.linear, late),
             start,
             observer(self.observables),
-            substeps=self.substeps,
+            substeps=self.substeps // parts,
             linear=self.linear,
             controller=self.controller,
         )
-        return ModelOutput(seen, {}, end)
+        return ModelOutput(jtu.tree_map(lambda x: x[::parts], seen), {}, end)
 
 
 class EventEngine(eqx.Module):
@@ -391,6 +394,18 @@ def with_values(model: _Model, values: Mapping[str, ArrayLike]) -> _Model:
     return replace_numbers(model, join_entries(scene_numbers(model), own))
 
 
+def split_samples(
+    t: Float[Array, " samples"], inputs: Inputs, linear: frozenset[str], parts: int
+) -> tuple[Float[Array, " times"], dict[str, Float[Array, " times"]]]:
+    """Times and inputs with each interval of the samples in `parts` equal parts."""
+    shares = jnp.arange(parts, dtype=t.dtype) / parts
+
+    def split(x: Array, rise: Array) -> Array:
+        return jnp.concatenate([jnp.reshape(x[:-1, None] + rise[:, None] * shares[None, :], (-1,)), x[-1:]])
+
+    return split(t, jnp.diff(t)), {k: split(x, jnp.diff(x) * (k in linear)) for k, x in inputs.items()}
+
+
 def delayed(
     t: Float[Array, " samples"],
     inputs: dict[str, Float[Array, " samples"]],
@@ -400,7 +415,7 @@ def delayed(
     """Inputs delayed by the `delay.*` [s] among the values, which may be a fraction of a sample.
 
     A held input that jumps between two samples is replaced by its mean over the interval. So the impulse is exact, and
-    the derivative by the delay exists.
+    the derivative by the delay exists. The motion is exact to second order in the interval.
     """
     shifted = dict(inputs)
     for name, x in inputs.items():

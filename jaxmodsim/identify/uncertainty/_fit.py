@@ -105,7 +105,7 @@ def fit(
     - `controller`: a `Controller` that closes a loop around the scene.
     - `shooting`: `MultipleShooting`, to run in windows.
     - `initializer`: of the search, one or several in sequence: `Staged()`, `MultiStart(...)`, `Continuation(...)`.
-    - `substeps`: integration steps between two samples.
+    - `substeps`: integration steps between two samples. They also resolve inputs that a delay moves between samples.
     - `accuracy`: relative tolerance of error-controlled steps.
     - `rtol`: relative change of the residual at which the search ends.
     - `max_steps`: limit of iterations. The damping is reset after every hundred of them; the result reports how often.
