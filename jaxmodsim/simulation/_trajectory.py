@@ -95,8 +95,9 @@ class Energy(AbstractReadable):
     - `stored`: energy in the states of friction laws (bristles).
     - `work_in`: energy supplied since t0 by applied forces, belts, moving constraints, and explicit time dependence of
       the Lagrangian.
-    - `dissipated`: energy lost since t0 in friction and impacts. For dynamic laws with a `normal_force` the energy in
-      the state counts as lost until it returns, because with a variable load it is no function of the state.
+    - `dissipated`: energy lost since t0 in friction and impacts, and at t0 if the initial state was projected. For
+      dynamic laws with a `normal_force` the energy in the state counts as lost until it returns, because with a
+      variable load it is no function of the state.
     - `balance`: kinetic + potential + stored + dissipated - work_in, less its value at t0: the error of the
       integration.
     """

@@ -57,7 +57,7 @@ class StoredSteps(dfx.AbstractAdjoint):
       by its magnitude. The error estimate of this tangent enters the norm of the step size control, relative to the
       largest values of its components so far. Without it steps grow without limit at rest, and the derivatives of such
       a run are wrong. The differentiated run makes other steps than the plain run; both keep the tolerance.
-    - `brief`: whether this error is relative to the squared mean root of each component so far instead. Stiff forces
+    - `brief`: whether this error is relative to a mean of each component over the time so far instead. Stiff forces
       that act briefly, such as those of a contact, need that: derivatives are large in the contact and nearly cancel
       behind it. It takes up to three times the steps. `simulate` asks for it where a scene has `HuntCrossley` contacts.
 
