@@ -43,9 +43,9 @@ _SHORT, _OVER_A_KINK = 8.0, 32.0
 class ProbeTangent(NamedTuple):
     """The tangents of the state and of the solver's state, and the magnitudes of the former so far.
 
-    Errors are relative to the magnitudes: the largest values, or, with `elapsed`, power means with the exponent 1/2 over
-    this time since the start. Through a stiff contact a tangent moves as the force does, thousands of times larger than
-    behind it, and parts cancel. An error that is small beside the peak would be most of what remains.
+    Errors are relative to the magnitudes: the largest values, or, with `elapsed`, means over this time since the start,
+    power means with the exponent 1/2. Through a stiff contact a tangent moves as the force does, thousands of times
+    larger than behind it, and parts cancel. An error that is small beside the peak would be most of what remains.
     """
 
     tangent: tuple[PyTree, PyTree]
