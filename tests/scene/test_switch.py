@@ -42,6 +42,19 @@ def test_a_switching_time_has_its_second_derivative():
     assert jax.jit(jax.hessian(by_begin))(3.0) == pytest.approx(3.5, rel=1e-8)
 
 
+@pytest.mark.parametrize("k", [1e8, 1e10])
+def test_derivatives_behind_a_switch_onto_a_stiff_spring(k):
+    """It acts for pi/sqrt(k), 3e-4 s or 3e-5 s, and gives the speed back."""
+    spring = jms.Switch(lambda t, q, qd, p: q[0], below=lambda t, q, qd, p: -p["k"] * q, name="spring")
+    scene = jms.Scene(lambda t, q, qd, p: 0.5 * qd[0] ** 2, {"k": k}, (spring,))
+
+    def after(v):
+        return jms.simulate(scene, [0.1], -v[None], 1.0, rtol=1e-9, atol=1e-12).qd[-1, 0]
+
+    value, slope = jax.jit(jax.value_and_grad(after))(2.0)
+    np.testing.assert_allclose([value, slope], [2.0, 1.0], rtol=1e-7)
+
+
 def test_a_switch_at_a_sample_of_an_input_has_the_derivative_of_its_own_force():
     """The jump of the input does not move with the switch."""
     motor = jms.Switch(lambda t, q, qd, p: p["stop"] - t, above=constant, name="motor")

@@ -101,7 +101,7 @@ def test_a_ball_bounces_with_a_fixed_step() -> None:
     np.testing.assert_allclose(solution.ys.log.t[0, :3], bounces(3), rtol=1e-12)
     # Steps of 10 ms, and for each bounce one that passes it and two around it. Near the tops of the arcs a few steps
     # are repeated: the dense output of the method is less exact than its steps.
-    assert 206 <= solution.stats["num_steps"] <= 220
+    assert 206 <= solution.stats["num_steps"] <= 222
 
 
 @pytest.mark.parametrize(

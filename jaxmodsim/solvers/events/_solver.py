@@ -20,8 +20,9 @@ from ._samples import SampledJumps, on_jump
 from ._state import ACCUMULATION, ONGOING, TOO_MANY, EventLog, EventMemory, EventState, Landing, StepReport, write
 
 # Landing distance, the largest distance of the end of a step from a root, as a fraction of the last steps, and of the
-# time since the last event. The state is carried over that distance with an error of its third power.
-_LANDING, _LANDING_OF_INTERVAL = 1e-5, 1e-2
+# time since the last event. The state is carried over that distance with an error of its third power, also by a field
+# behind the event that is many times faster than the last steps: that of a stiff contact.
+_LANDING, _LANDING_OF_INTERVAL = 1e-8, 1e-2
 # A step that is at most this part of the last ones counts as one without length: guards vary by their rounding.
 _SHORT = 1e-6
 # Within this part of the last steps after an event a guard without a root is one that the event has violated.
@@ -86,7 +87,7 @@ class EventSolver(AbstractSolverWrapper):
 
     - *At the start* the guards with `g_i(t0) > 0` are armed. The others wait until they are positive: a guard that is
       violated on entry, or zero and falling, does not fire; one that is zero and rising is armed as it rises.
-    - *At an event* all armed guards whose roots lie within the landing distance (1e-5 of a step) of the first one
+    - *At an event* all armed guards whose roots lie within the landing distance (1e-8 of a step) of the first one
       fire together, in one call of `reset` with all of them marked in `fired`. Later roots in the same step are
       searched again after the reset.
     - *After an event* the guards that fired wait until they are positive, so that each crossing fires once; other armed
