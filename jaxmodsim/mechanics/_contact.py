@@ -18,8 +18,26 @@ from .._core.position import PositionFn, ScalarOrFn, as_optional_position_fn, as
 from .._core.safe import rounding_of, safe_power
 from ._constraints import AbstractEquations, AbstractPositionConstraint
 
-# Newton steps to the speed after an impact; at low speed each of the first steps only halves the error.
-_NEWTON = 60
+# Newton steps to the speed after an impact.
+_NEWTON = 10
+# Up to this y = 3/2 damping speed, the coefficient of restitution of a compliant contact is its series.
+_SMALL = 0.3
+
+
+def _rebound_series(number: int) -> np.ndarray:
+    """Coefficients of `e` in powers of y, the highest first: `w = e y` satisfies `(1 + y) w w' = y (1 - w)`."""
+    w = np.zeros(number + 1)
+    w[1] = 1.0
+    squares = np.zeros(number + 1)  # 2 w w' in powers of y
+    squares[1] = 2.0
+    for k in range(2, number + 1):
+        inner = np.dot(w[2:k], w[k - 1 : 1 : -1])
+        w[k] = -(0.5 * (squares[k - 1] + (k + 1) * inner) + w[k - 1]) / (k + 1)
+        squares[k] = (k + 1) * (inner + 2.0 * w[k])
+    return w[:0:-1]
+
+
+_REBOUND = _rebound_series(32)
 
 
 class Poisson(AbstractRanged):
@@ -125,13 +143,16 @@ class HuntCrossley(AbstractRanged):
         With `y = 3/2 damping speed` it solves `(1 + e) y = log((1 + y)/(1 - e y))`, for any mass, k and n.
         """
         y = 1.5 * self.damping * speed
-        c = 1.0 + y - jnp.log1p(y)  # u - log(u) = c for u = 1 - e y, from below
+        small = y < _SMALL
+        large = jnp.where(small, _SMALL, y)
+        c = jnp.minimum(1.0 + large - jnp.log1p(large), 60.0)  # u - log(u) = c for u = 1 - e y, from below
 
         def step(_: object, u: Array) -> Array:
-            return u + (u - jnp.log(u) - c) * u / jnp.where(u < 1.0, 1.0 - u, 1.0)
+            return u + (u - jnp.log(u) - c) * u / (1.0 - u)
 
         u = jax.lax.stop_gradient(jax.lax.fori_loop(0, _NEWTON, step, jnp.exp(-c)))
-        return jnp.where(y > 1e-6, (1.0 - step(0, u)) / jnp.where(y > 1e-6, y, 1.0), 1.0 - y / 1.5)
+        u = step(0, step(0, u))  # the first step has the first derivative, the second one the second
+        return jnp.where(small, jnp.polyval(_REBOUND, jnp.where(small, y, 0.0)), (1.0 - u) / large)
 
 
 class Contact(AbstractPositionConstraint):

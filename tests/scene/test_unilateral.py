@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mpmath
 import numpy as np
 import pytest
 from scipy.special import ellipk
@@ -319,6 +320,30 @@ def test_a_compliant_contact_gives_back_what_its_closed_form_says(law):
     assert (np.diff(run.energy.dissipated) >= -1e-9).all()
     np.testing.assert_allclose(run.energy.dissipated[-1], 4.0 * (1.0 - e**2), rtol=1e-7)
     assert np.min(run.reactions["floor"].multiplier) >= 0.0
+
+
+def test_the_coefficient_of_restitution_of_a_compliant_contact():
+    """And its derivatives of first and second order: w = e y satisfies -w - log(1 - w) = y - log(1 + y)."""
+
+    def coefficient(y):
+        return jms.HuntCrossley(1.0, damping=y / 1.5).restitution(1.0)
+
+    def exact(y):
+        y = mpmath.mpf(y)
+        c = y - mpmath.log1p(y)
+        w = 1 - mpmath.exp(-1 - c) if y > 0.5 else y - 2 * y**2 / 3
+        for _ in range(20):
+            w += (w + mpmath.log1p(-w) + c) * (1 - w) / w
+        slope = y * (1 - w) / ((1 + y) * w)
+        bend = (1 - w) / ((1 + y) ** 2 * w) - y * slope / ((1 + y) * w**2)
+        return w / y, slope / y - w / y**2, bend / y - 2 * slope / y**2 + 2 * w / y**3
+
+    ours = jax.jit(lambda y: (coefficient(y), jax.grad(coefficient)(y), jax.grad(jax.grad(coefficient))(y)))
+    with mpmath.workdps(100):
+        for y in (1e-9, 1e-6, 2e-6, 1e-3, 0.1, 0.299, 0.301, 0.6, 3.0, 20.0, 100.0):
+            np.testing.assert_allclose(ours(y), [float(x) for x in exact(y)], rtol=1e-11, err_msg=f"y = {y}")
+    np.testing.assert_allclose(ours(0.0), [1.0, -2 / 3, 8 / 9], rtol=1e-14)
+    np.testing.assert_allclose(ours(1e4), [1e-4, -1e-8, 2e-12], rtol=1e-14)
 
 
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])

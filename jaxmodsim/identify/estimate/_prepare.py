@@ -444,14 +444,6 @@ def step_changes(search: SearchResult) -> dict[str, Float[np.ndarray, "runs samp
     return changes
 
 
-def step_error(search: SearchResult, changes: Mapping[str, Float[np.ndarray, "runs samples"]]) -> float | None:
-    """Root mean square of the `step_changes` of the one channel; None without such steps, or for several channels."""
-    if len(changes) != 1:
-        return None
-    ((name, moved),) = changes.items()
-    return float(np.sqrt(np.sum(moved**2) / np.sum(search.residuals[name][1])))
-
-
 def measured_start(record: Record, observables: Observables, dof: int) -> tuple[np.ndarray, np.ndarray]:
     """Measured coordinates and velocities at the first sample; zero for the others."""
     q, qd = np.zeros(dof), np.zeros(dof)

@@ -13,8 +13,9 @@ from scipy import special  # scipy.stats takes most of a second to import
 from ..._core.arguments import as_share
 from ..._core.arrays import on_device
 from ..data._record import Record
+from ..estimate._prepare import step_changes
 from ..estimate._problem import FitProblem
-from ..estimate._search import SearchState, linearised, state_at
+from ..estimate._search import SearchResult, SearchState, linearised, state_at
 from ..model._observe import RecordedMotion, motion_of
 
 # Blocks of samples: enough for the scatter of the scores of a dozen parameters, each much longer than the correlation
@@ -30,8 +31,6 @@ _BEYOND, _NO_PART = 4.0, 1e-8
 # residual is not white. Keeps divisions finite.
 _LAGS_A_DECADE, _SAMPLES_A_LAG = 10, 5
 _CHANCE, _TINY = 0.01, 1e-30
-# More integration steps are asked for where they move a parameter by this share of its standard error.
-_STEP_MOVES = 0.5
 # Derivatives are tested over this share of a standard error; their error must be below this share of the change.
 _TRIED, _HOLDS = 0.1, 0.5
 # Share of the largest information from which an axis is determined.
@@ -112,8 +111,8 @@ class FitDiagnostics:
     - `rmse`: root mean square of output less measured value, by channel, in its unit.
     - `noise`: standard deviation of each channel, known or estimated.
     - `ending`: why the search ended. `evaluations`: of the model and its derivatives.
-    - `step_error`: root mean square change of the output with four times as many integration steps; None without such
-      steps.
+    - `step_moves`: by how many standard errors each parameter moves with four times as many integration steps; empty
+      for adaptive steps.
     - `starts`: root mean square, in noise levels, at the end from each of several starts, best first.
     - `single_precision`: whether it was computed in float32.
     - `issues`: deficiencies of the motion, with the parameters that they leave unknown; part of the warnings.
@@ -123,7 +122,7 @@ class FitDiagnostics:
     noise: dict[str, float]
     ending: str
     evaluations: int
-    step_error: float | None
+    step_moves: dict[str, float]
     starts: tuple[float, ...]
     single_precision: bool
     issues: tuple[IdentifiabilityIssue, ...]
@@ -413,38 +412,28 @@ def offset_issues(
     return tuple(issues)
 
 
-def step_issues(
-    problem: FitProblem,
-    state: SearchState,
-    entries: Sequence[int],
-    errors: Mapping[str, float],
-    changes: Mapping[str, Float[np.ndarray, "runs samples"]],
-) -> tuple[IdentifiabilityIssue, ...]:
-    """The parameter that more integration steps move farthest, if that is half of its standard error or more.
+def step_moves(search: SearchResult, entries: Sequence[int], errors: Mapping[str, float]) -> dict[str, float]:
+    """By how many standard errors each parameter moves with four times as many integration steps.
 
     One Gauss-Newton step. A small error of the steps counts in long records, since it is the same in all of them.
 
     **Arguments:**
 
     - `entries`: entries of x whose parameters count. `errors`: their standard errors by name.
-    - `changes`: of the output with more steps, by channel.
+
+    **Returns:**
+
+    The moves by name; none for adaptive steps, or if the output of the finer steps is not finite.
     """
+    problem, state, changes = search.problem, search.state, step_changes(search)
     if not changes or not all(np.isfinite(each).all() for each in changes.values()):
-        return ()
+        return {}
     rows = [changes[name] / float(problem.noise[name]) for name in problem.columns]
     scaled, size = in_unit_columns(np.asarray(state.jacobian, float))
     moved = np.concatenate([np.concatenate(rows, axis=1).reshape(-1), np.zeros(problem.rows - problem.samples)])
     step = -np.linalg.lstsq(scaled, moved, rcond=_NO_PART)[0] / size
     far = np.abs(problem.slopes_at(state.x) @ step)[list(entries)]
-    known = {name: x / errors[name] for name, x in zip(errors, far.tolist(), strict=True) if errors[name] > 0}
-    name = max(known, key=lambda name: known[name], default="")
-    if not name or not known[name] > _STEP_MOVES:
-        return ()
-    sentence = (
-        f"The integration step shows: with four times as many, {name} moves by {known[name]:.2g} standard errors."
-        " Raise substeps."
-    )
-    return (IdentifiabilityIssue(sentence, ()),)
+    return {name: x / errors[name] for name, x in zip(errors, far.tolist(), strict=True) if errors[name] > 0}
 
 
 def derivatives_hold(problem: FitProblem, state: SearchState) -> bool:

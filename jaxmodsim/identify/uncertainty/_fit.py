@@ -23,8 +23,6 @@ from ..estimate._prepare import (
     StartState,
     prepare,
     prepare_law,
-    step_changes,
-    step_error,
 )
 from ..estimate._problem import AbstractLoss, SquaredLoss
 from ..estimate._search import Progress, SearchOptions, SearchResult, continued, solve_freed, solve_with_noise
@@ -38,10 +36,10 @@ from ._estimate import (
     covariance_of,
     natural_scales,
     offset_issues,
-    step_issues,
+    step_moves,
 )
 from ._identifiability import identifiability_issues
-from ._result import FitResult, step_shows, uncertain_of
+from ._result import FitResult, uncertain_of
 
 _ROUGH = (
     "Standard errors are refused: over a tenth of a standard error the output does not change as its derivatives"
@@ -272,18 +270,15 @@ def result_of(
         numbers={name: np.asarray(x) for name, x in scene_numbers(model).items()},
         model=model,
     )
-    changes = step_changes(search)
-    change = step_error(search, changes)
     diagnostics = FitDiagnostics(
         rmse=rmse,
         noise={name: float(x) for name, x in problem.noise.items()},
         ending=search.ending,
         evaluations=search.iterations,
-        step_error=change,
+        step_moves=step_moves(search, entries, estimate.errors),
         starts=starts,
         single_precision=jnp.result_type(float) == jnp.float32,
         issues=(
-            *(() if step_shows(rmse, change) else step_issues(problem, state, entries, estimate.errors, changes)),
             *offset_issues(problem, state, entries, np.array(list(estimate.errors.values()))),
             *_issues(estimate, provenance, search, covariance.refused),
         ),

@@ -33,8 +33,8 @@ _FOLLOWS = 0.9
 # Excess of the mean square error over the noise from sample to sample that is reported: at least this share, and so
 # many times one over the root of the number of samples, which is four standard deviations of the ratio.
 _EXCESS, _SCATTER = 0.2, 15.0
-# Share of the RMSE from which the error of the integration step is reported.
-_STEP_SHOWS = 0.1
+# More integration steps are asked for where they move a parameter by this share of its standard error.
+_STEP_SHOWS = 0.5
 
 _KIND, _VERSION, _TEXT = "jaxmodsim fit result", 2, "result.json"
 _PARTS = {"estimate": ParameterEstimate, "diagnostics": FitDiagnostics, "provenance": FitProvenance}
@@ -198,7 +198,7 @@ class FitResult(AbstractReadable):
                 "correlation": {"names": list(estimate.values), "matrix": estimate.correlation.tolist()},
                 "evaluations": diagnostics.evaluations,
                 "ending": diagnostics.ending,
-                "step_error": diagnostics.step_error,
+                "step_moves": diagnostics.step_moves,
                 "warnings": list(warnings_for(self)),
             }
         )
@@ -266,19 +266,13 @@ def warnings_for(result: FitResult) -> tuple[str, ...]:
 
 
 def is_step_size_limited(result: FitResult) -> bool:
-    """Whether more integration steps between samples would change the RMSE of a fit with one channel.
+    """Whether four times as many integration steps would move a parameter by half of its standard error or more.
 
     **Returns:**
 
     A `bool`.
     """
-    return step_shows(result.diagnostics.rmse, result.diagnostics.step_error)
-
-
-def step_shows(rmse: Mapping[str, float], change: float | None) -> bool:
-    """Whether the error of the integration step, if it is known, is large against the RMSE of the one channel."""
-    errors = list(rmse.values())
-    return change is not None and len(errors) == 1 and change > _STEP_SHOWS * errors[0]
+    return max(result.diagnostics.step_moves.values(), default=0.0) > _STEP_SHOWS
 
 
 def uncertain_of(estimate: ParameterEstimate) -> dict[str, tuple[str, ...]]:
@@ -296,9 +290,10 @@ def _of_the_search(result: FitResult) -> list[str]:
     if not ended_by_itself(diagnostics.ending):
         sentences.append(f"The search {diagnostics.ending}: do not trust the standard errors.")
     if is_step_size_limited(result):
+        name, moves = max(diagnostics.step_moves.items(), key=lambda item: item[1])
         sentences.append(
-            f"The integration step shows: with four times as many the output moves by {diagnostics.step_error:.2g}"
-            f" (root mean square) against an RMSE of {next(iter(diagnostics.rmse.values())):.2g}. Raise substeps."
+            f"The integration step shows: with four times as many, {name} moves by {moves:.2g} standard errors."
+            " Raise substeps."
         )
     for channel, rmse in diagnostics.rmse.items():
         columns = _columns(result, channel)
