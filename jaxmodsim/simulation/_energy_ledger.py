@@ -73,11 +73,11 @@ def at_events(
     **Arguments:**
 
     - `start`: the first state of the run.
-    - `log`: the log of events; None for a scene without contacts.
+    - `log`: the log of events; None if the run kept none, as without contacts.
     """
     scene = request.scene
     lost = _energy(scene, request.t0, request.initial_state) - _energy(scene, request.t0, start)
-    if log is None:
+    if log is None or not scene.contacts:
         return jnp.broadcast_to(lost, t.shape), {}
 
     def strike(happened: Array, t: Array, log: EventLog) -> tuple[Array, dict[str, Array]]:

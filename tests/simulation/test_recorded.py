@@ -55,8 +55,9 @@ def test_more_events_take_another_run(scene: jms.Scene):
     np.testing.assert_allclose(recorded.events.t, want, rtol=1e-6)
 
 
-def test_recorded_energies_take_no_other_run(scene: jms.Scene, run: jms.Trajectory):
-    recorded = jms.simulate(scene, [0.0], BELT, T1, ts=TS, record=("energy",))
+@pytest.mark.parametrize("record", [("energy",), ("events", "energy")])
+def test_recorded_energies_take_no_other_run(scene: jms.Scene, run: jms.Trajectory, record: tuple[str, ...]):
+    recorded = jms.simulate(scene, [0.0], BELT, T1, ts=TS, record=record)
     compiled = compiled_runs()
     found = recorded.energy
     assert compiled_runs() == compiled
