@@ -340,21 +340,25 @@ def project(
 ) -> tuple[PerDof, PerDof]:
     """Project coordinates and velocities onto the constraints, by least changes in the metric of the mass matrix.
 
-    Two Newton steps with a constant mass matrix change the coordinates; then the smallest impulses change the
-    velocities.
+    Two steps of Newton's method change the coordinates, both with the mass matrix and the Jacobian of their start; then
+    the smallest impulses change the velocities. Errors that are small, as those of a step, are left with their third
+    power in the coordinates, and with the product of both in the velocities.
 
     **Returns:**
 
     Coordinates and velocities, shape `[dof]` each.
     """
     error = errors(constraints, t, params)
-    if error(q).shape != (0,):
+    rows = _jacobian(error, q)
+    minv_jt, matrix = _mobility(rows, mass)
+    if rows.size:
         for _ in range(_NEWTON):
-            minv_jt, matrix = _mobility(_jacobian(error, q), mass)
             q = q - jnp.sum(minv_jt * solve_balanced(matrix, error(q))[:, None], axis=0)
     rate = rates(constraints, t, q, params)
-    minv_jt, matrix = _mobility(_jacobian(rate, qd), mass)
-    return q, qd - jnp.sum(minv_jt * solve_balanced(matrix, rate(qd))[:, None], axis=0)
+    change = rate(qd)
+    if change.shape != rows.shape[:1]:  # not all constraints are holonomic
+        minv_jt, matrix = _mobility(_jacobian(rate, qd), mass)
+    return q, qd - jnp.sum(minv_jt * solve_balanced(matrix, change)[:, None], axis=0)
 
 
 def constraint_residual(
