@@ -8,6 +8,7 @@ from collections.abc import Callable
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from .._core.arguments import as_whole
@@ -65,8 +66,9 @@ def _rate(t: Array, p: Scene, y: State) -> PyTree:
 
 
 def _step(t0: Array, t1: Array, p: Scene, y: State) -> PyTree:
-    """One step of ImplicitFriction from t0 to t1; false (0) where its equations were not solved."""
-    return scene_step(p, t0, t1, y)
+    """One step of ImplicitFriction from t0 to t1; false (0) where it is not solved, or y is not finite after it."""
+    after, solved = scene_step(p, t0, t1, y)
+    return after, solved & jnp.all(jnp.isfinite(ravel_pytree(after)[0]))
 
 
 def _friction(t0: Array, t1: Array, p: Scene, y: State) -> PyTree:
@@ -81,7 +83,8 @@ def to_c(scene: Scene, dof: int = 1, *, name: str = "scene") -> str:
     functions allocate no memory and have no internal state, and every loop has a constant bound:
 
     - `NAME_rate(t, p, y, rate)`: rates of the state `y`, for an observer or another solver.
-    - `NAME_step(t0, t1, p, y)`: one step of `ImplicitFriction`, in place; returns 0 if its equations were not solved.
+    - `NAME_step(t0, t1, p, y)`: one step of `ImplicitFriction`, in place; returns 0 if its equations were not solved,
+      or the state is not finite.
     - `NAME_run(t, h, steps, p, y)`: several steps, the same as `simulate(..., dt=h)`.
     - `NAME_friction(t0, t1, p, y, force)`, for scenes with friction: the force that compensates friction in each cycle.
       Write the planned coordinates and velocities to `y`; the function advances the states of the laws in `y`.

@@ -292,7 +292,8 @@ static int mark(Motion *c, double near, int first) {
   s->pending = 0;
   for (int i = 0; i < MODES; ++i) {
     const double left = above(g, i);
-    const int comes = rates[i] < 0.0 && left >= 0.0 && left <= -rates[i] * near;
+    /* The gap of a contact that opens has a velocity of rounding, of either sign, which does not close it again. */
+    const int comes = rates[i] < -c->tolerances[0] && left >= 0.0 && left <= -rates[i] * near;
     const int beyond = g[i] < 0.0 && (rates[i] <= 0.0 || g[i] < -g[MODES + i]);
     if (g[i] > 0.0) s->waits[i] = 0;
     s->fired[i] = i == first || (!s->waits[i] && (comes || beyond));
@@ -355,8 +356,8 @@ int motion_fire(Motion *c) {
     const double unit = c->coarse ? larger(s->rtol, DBL_EPSILON) : DBL_EPSILON;
     const double vanishes = larger(ACCUMULATION * sqrt(unit) * (s->t - s->begin), 64.0 * DBL_EPSILON * fabs(s->t));
     const int dense = s->resets >= FEWEST && s->spread <= vanishes;
-    if (dense && !CONTACTS) {
-      c->failure = "events accumulate: friction switches again and again without time between (chatter)";
+    if (dense && (!CONTACTS || (s->resets > TRIALS && s->spread == 0.0))) {
+      c->failure = "events accumulate: modes switch again and again without time between (chatter)";
       return 0;
     }
     memcpy(y, s->y, sizeof y), memcpy(mode, s->mode, sizeof mode);

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -13,7 +14,7 @@ from ..helpers.compilers import OWN, needs_fmpy
 fmpy = pytest.importorskip("fmpy", reason="needs FMPy, which runs FMUs")
 
 
-def opened(kind: str, path: Path) -> tuple[Any, dict[str, int], list[bytes]]:
+def opened(kind: str, path: Path, **options: Any) -> tuple[Any, dict[str, int], list[bytes]]:
     """An instance of an FMU, of a class of `fmpy.fmi3`; the references of its variables; and what it will log."""
     from fmpy import fmi3
 
@@ -23,7 +24,7 @@ def opened(kind: str, path: Path) -> tuple[Any, dict[str, int], list[bytes]]:
         guid=description.guid, unzipDirectory=folder, modelIdentifier=path.stem, instanceName="one"
     )
     said: list[bytes] = []
-    one.instantiate(logMessage=lambda _environment, _status, _category, message: said.append(message))
+    one.instantiate(logMessage=lambda _environment, _status, _category, message: said.append(message), **options)
     return one, {each.name: each.valueReference for each in description.modelVariables}, said
 
 
@@ -104,3 +105,40 @@ def test_an_input_out_of_range_between_events_of_model_exchange_is_refused(tmp_p
     one.getContinuousStateDerivatives(rates, 2)
     assert list(rates) == [0.3, -1.0]
     one.freeInstance()
+
+
+@needs_fmpy
+def test_a_contact_that_opens_without_restitution_stays_open(tmp_path: Path) -> None:
+    """The velocity of its gap is rounding, of either sign: it closed again, and a step never ended."""
+    scene = jms.Scene(
+        lambda t, q, qd, p: 0.5 * p["m"] * qd[0] ** 2 + (p["u"] + p["a"] * jnp.sin(p["w"] * t)) * q[0],
+        {"m": 1.627597215428478, "a": 3.2879113866395064, "w": 5.701113437864923, "u": 0.6026897183986004},
+        constraints=(
+            jms.Contact(lambda t, q, p: q[0] + 0.057916205110450966, name="lower"),
+            jms.Contact(lambda t, q, p: 0.09133682950280056 - q[0], restitution=0.434171525044368, name="upper"),
+        ),
+    )
+    path = jms.export.fmu(
+        scene, [-0.019056054820276398], [-0.471320541735349], tmp_path / "stops.fmu", inputs=["u"], platforms=[OWN]
+    )
+    one, place, _ = opened("FMU3Slave", path, eventModeUsed=True, earlyReturnAllowed=True)
+    one.enterInitializationMode(tolerance=1e-9, startTime=0.0)
+    one.exitInitializationMode()
+    one.updateDiscreteStates()
+    one.enterStepMode()
+    times, t = [], 0.0
+    for end, load in ((1.0, 0.42603236), (2.0, -1.86381767), (3.0, -0.28214342), (4.0, 0.0)):
+        while t < end and len(times) < 50:
+            event, _, _, t = one.doStep(t, end - t)
+            if event:
+                times.append(t)
+            one.enterEventMode()
+            if t >= end:
+                one.setFloat64([place["u"]], [load])
+            one.updateDiscreteStates()
+            one.enterStepMode()
+    one.freeInstance()
+    # By SciPy's DOP853 at 1e-12, from event to event.
+    exact = [0.0882771040, 0.4719734099, 0.8794351842, 1.0793057599, 1.5466246340]
+    exact += [1.9780858752, 2.3099122565, 3.0511832705, 3.3213641776, 3.8241899467]
+    np.testing.assert_allclose(times, exact, atol=1e-8, rtol=0)

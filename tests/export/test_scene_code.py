@@ -269,6 +269,8 @@ def test_steps_end_whatever_they_are_given(in_c: Callable[[str], InC]) -> None:
     for h in (0.0, -1.0, 1e300, np.nan):
         solved, _, after = in_c("lugre box")("s", 0.0, h, y)
         assert len(solved) == len(after) == len(y)
+        # No success with numbers that are not finite, as in `simulate`.
+        assert np.isfinite(after[np.array(solved)]).all()
 
 
 @needs_compiler
