@@ -13,6 +13,8 @@
 #define ACCUMULATION 1e-3
 #define FEWEST 8
 #define FORGET 0.05
+/* A step ends on a root behind this fraction of it. */
+#define ENDS 0.99
 /* Attempts that are repeated because guards are not resolved. */
 #define DOUBTS 12
 #define TRIALS 200
@@ -409,6 +411,7 @@ int motion_fire(Motion *c) { return (void)c, 1; }
 int motion_advance(Motion *c, double end) {
   State *s = &c->s;
   int doubts = 0;
+  double most = INFINITY;
   if (s->step <= 0.0) first_step(c);
   for (int trial = 0; trial < TRIALS; ++trial) {
     const double left = end - s->t;
@@ -416,8 +419,9 @@ int motion_advance(Motion *c, double end) {
       s->t = end;
       return REACHED;
     }
-    const int last = s->step >= left * (1.0 - 1e-9);
-    const double h = last ? left : s->step, error = attempt(c, h);
+    const double length = smaller(s->step, most);
+    const int last = length >= left * (1.0 - 1e-9);
+    const double h = last ? left : length, error = attempt(c, h);
     const double next = h * within(0.2, 0.9 * pow(error, -0.2), 10.0);
     if (!(error <= 1.0)) {
       s->step = error < INFINITY ? next : 0.2 * h;
@@ -431,7 +435,12 @@ int motion_advance(Motion *c, double end) {
     double factor;
     int first = 0;
     const double part = look(c, h, &factor, &first);
-    if (part <= 1.0) {
+    /* A step past a root is repeated up to it: its five points may miss a fall before, in stick above all. */
+    if (part < ENDS && part * h > resolution(s) && doubts++ < DOUBTS) {
+      most = (1.0 + 0.5 * (1.0 - ENDS)) * part * h;
+      continue;
+    }
+    if (part <= 1.0 && (factor >= 0.9 || part * h <= resolution(s) || doubts >= DOUBTS)) {
       land(c, h, part, first);
       return EVENT;
     }
@@ -443,7 +452,7 @@ int motion_advance(Motion *c, double end) {
       if (c->guards[4][i] > 0.0) s->waits[i] = 0;
     }
 #else
-    (void)doubts;
+    (void)doubts, (void)most;
 #endif
     memcpy(s->y, c->end, sizeof s->y);
     s->t = last ? end : s->t + h;

@@ -142,3 +142,32 @@ def test_a_contact_that_opens_without_restitution_stays_open(tmp_path: Path) -> 
     exact = [0.0882771040, 0.4719734099, 0.8794351842, 1.0793057599, 1.5466246340]
     exact += [1.9780858752, 2.3099122565, 3.0511832705, 3.3213641776, 3.8241899467]
     np.testing.assert_allclose(times, exact, atol=1e-8, rtol=0)
+
+
+@needs_fmpy
+def test_a_long_step_out_of_stick_ends_on_the_first_break_away(tmp_path: Path) -> None:
+    """The motion of stick has no error, so that its step is 1.5 s; the load passes the limit earlier, and again."""
+    scene = jms.Scene(
+        lambda t, q, qd, p: 0.5 * p["m"] * qd[0] ** 2 - 0.5 * p["k"] * q[0] ** 2 + p["a"] * jnp.sin(p["w"] * t) * q[0],
+        {"m": 2.3759116815751313, "k": 14.814306529511397, "a": 1.9407638977265402, "w": 7.865160398608671},
+        (jms.Friction(jms.Coulomb(1.453988632396544), belt_velocity=-0.17848703676370337),),
+    )
+    path = jms.export.fmu(scene, [-0.20360879473492388], [-0.17848703676370337], tmp_path / "m.fmu", platforms=[OWN])
+    one, place, _ = opened("FMU3Slave", path, eventModeUsed=True, earlyReturnAllowed=True)
+    one.enterInitializationMode(tolerance=1e-9, startTime=0.0)
+    one.exitInitializationMode()
+    one.updateDiscreteStates()
+    one.enterStepMode()
+    times, t = [], 0.0
+    while t < 3.0:
+        event, _, _, t = one.doStep(t, 3.0 - t)
+        if event:
+            times.append(t)
+            one.enterEventMode()
+            one.updateDiscreteStates()
+            one.enterStepMode()
+    # By SciPy's DOP853 at 1e-12, from event to event.
+    exact = [1.4982244891, 1.5146932181, 1.6802298164, 2.1310398227, 2.3733306343]
+    np.testing.assert_allclose(times, exact, atol=1e-8, rtol=0)
+    assert one.getFloat64([place["q[0]"]]) == pytest.approx([-0.10962611], abs=1e-8)
+    one.freeInstance()
