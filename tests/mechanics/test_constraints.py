@@ -91,10 +91,34 @@ def test_smallest_solution_of_a_singular_system() -> None:
     ones = jnp.ones(3)
     ours = solve_semidefinite(matrix, rhs, ones, jnp.ones(3, bool))
     np.testing.assert_allclose(matrix @ ours, rhs, atol=1e-13)
-    np.testing.assert_allclose(ours, np.linalg.pinv(np.asarray(matrix)) @ np.asarray(rhs), atol=1e-7)
+    np.testing.assert_allclose(ours, np.linalg.pinv(np.asarray(matrix)) @ np.asarray(rhs), atol=1e-13)
     part = solve_semidefinite(matrix, rhs, ones, jnp.array([True, False, True]))
     np.testing.assert_allclose(part[jnp.array([0, 2])], np.linalg.solve(matrix[::2, ::2], rhs[::2]), rtol=1e-12)
     assert float(part[1]) == 0.0
+
+
+@pytest.mark.parametrize("n", [2, 3, 4])
+def test_solutions_of_least_norm(n: int) -> None:
+    """Against the pseudo-inverse: rows of any size and rank, some of them not active, with weights."""
+    rng, error = np.random.default_rng(0), 1e-11 if n < 4 else 1e-7
+    solve = jax.jit(solve_semidefinite)
+    for rank, _ in itertools.product(range(1, n + 1), range(40)):
+        rows = rng.normal(size=(n, rank)) * 10 ** rng.uniform(-1, 1, size=(n, 1))
+        matrix, weight, active = rows @ rows.T, 10 ** rng.uniform(-0.5, 0.5, n), rng.random(n) < 0.8
+        scaled = (matrix * weight[:, None] * weight[None, :])[np.ix_(active, active)]
+        values = np.linalg.eigvalsh(scaled)
+        if not active.any() or values[values > 1e-12 * values[-1]][0] < 1e-4 * values[-1]:
+            continue
+        rhs = np.zeros((n, 2))
+        rhs[active] = matrix[np.ix_(active, active)] @ rng.normal(size=(active.sum(), 2))
+        exact = np.zeros((n, 2))
+        inverse = np.linalg.pinv(scaled, rcond=1e-12, hermitian=True)
+        exact[active] = weight[active, None] * (inverse @ (weight[active, None] * rhs[active]))
+        ours = solve(matrix, rhs, weight, active)
+        np.testing.assert_allclose(ours, exact, atol=error * np.abs(exact).max())
+        np.testing.assert_allclose(
+            solve(matrix, rhs[:, 0], weight, active), ours[:, 0], atol=error * np.abs(exact).max()
+        )
 
 
 def drift(run: Any) -> float:
