@@ -75,8 +75,8 @@ def main(record_file: Path, out: Path, smoke: bool = False) -> None:
             model.free,
             limits={"m": (0.0, None)},
         )
-        moved = max(result.diagnostics.step_moves.values())
-        print(f"\n{name}: {model.description}\n{result}\nfour steps for every sample move it by {moved:.4f} errors")
+        moved = 1e3 * result.diagnostics.step_error["measured"]
+        print(f"\n{name}: {model.description}\n{result}\nfour steps for every sample move it by {moved:.4f} mm")
         fit_figure(result, caption=SOURCE).savefig(out / f"b0_emps_{name}.png", dpi=130)
     if not smoke:
         candidates = {name: Candidate(axis_scene(x, estimate), x.free, x.description) for name, x in fitted.items()}

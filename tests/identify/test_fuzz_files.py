@@ -47,7 +47,8 @@ def fit_result() -> FitResult:
         white=np.eye(2), information=np.eye(2), logarithmic=("m",), bounds={"m": (0.0, float("inf"))},
     )  # fmt: skip
     diagnostics = FitDiagnostics(
-        rmse={"x": 0.1}, noise={"x": 0.1}, ending="converged", evaluations=3, step_moves={"k": 0.25}, starts=(1.0,),
+        rmse={"x": 0.1}, noise={"x": 0.1}, ending="converged", evaluations=3, starts=(1.0,),
+        step_error={"x": 1e-3}, step_moves={"k": 0.25},
         single_precision=False, issues=(),
     )  # fmt: skip
     provenance = FitProvenance(

@@ -262,7 +262,7 @@ def odd(result) -> FitResult:
     return replace(
         result,
         estimate=replace(result.estimate, covariance=covariance),
-        diagnostics=replace(result.diagnostics, step_moves={"m": 0.1 + 0.2}, issues=issues),
+        diagnostics=replace(result.diagnostics, step_error={"measured": 0.1 + 0.2}, step_moves={}, issues=issues),
     )
 
 

@@ -13,9 +13,8 @@ from scipy import special  # scipy.stats takes most of a second to import
 from ..._core.arguments import as_share
 from ..._core.arrays import on_device
 from ..data._record import Record
-from ..estimate._prepare import step_changes
 from ..estimate._problem import FitProblem
-from ..estimate._search import SearchResult, SearchState, linearised, state_at
+from ..estimate._search import SearchState, linearised, state_at
 from ..model._observe import RecordedMotion, motion_of
 
 # Blocks of samples: enough for the scatter of the scores of a dozen parameters, each much longer than the correlation
@@ -111,8 +110,8 @@ class FitDiagnostics:
     - `rmse`: root mean square of output less measured value, by channel, in its unit.
     - `noise`: standard deviation of each channel, known or estimated.
     - `ending`: why the search ended. `evaluations`: of the model and its derivatives.
-    - `step_moves`: by how many standard errors each parameter moves with four times as many integration steps; empty
-      for adaptive steps.
+    - `step_error`: root mean square change of each channel with four times as many integration steps, and
+      `step_moves`: by how many standard errors each parameter moves then; both empty for adaptive steps.
     - `starts`: root mean square, in noise levels, at the end from each of several starts, best first.
     - `single_precision`: whether it was computed in float32.
     - `issues`: deficiencies of the motion, with the parameters that they leave unknown; part of the warnings.
@@ -122,6 +121,7 @@ class FitDiagnostics:
     noise: dict[str, float]
     ending: str
     evaluations: int
+    step_error: dict[str, float]
     step_moves: dict[str, float]
     starts: tuple[float, ...]
     single_precision: bool
@@ -412,7 +412,13 @@ def offset_issues(
     return tuple(issues)
 
 
-def step_moves(search: SearchResult, entries: Sequence[int], errors: Mapping[str, float]) -> dict[str, float]:
+def step_moves(
+    problem: FitProblem,
+    state: SearchState,
+    entries: Sequence[int],
+    errors: Mapping[str, float],
+    changes: Mapping[str, Float[np.ndarray, "runs samples"]],
+) -> dict[str, float]:
     """By how many standard errors each parameter moves with four times as many integration steps.
 
     One Gauss-Newton step. A small error of the steps counts in long records, since it is the same in all of them.
@@ -420,12 +426,12 @@ def step_moves(search: SearchResult, entries: Sequence[int], errors: Mapping[str
     **Arguments:**
 
     - `entries`: entries of x whose parameters count. `errors`: their standard errors by name.
+    - `changes`: of the output with more steps, by channel.
 
     **Returns:**
 
-    The moves by name; none for adaptive steps, or if the output of the finer steps is not finite.
+    The moves by name; none without changes, or if they are not finite.
     """
-    problem, state, changes = search.problem, search.state, step_changes(search)
     if not changes or not all(np.isfinite(each).all() for each in changes.values()):
         return {}
     rows = [changes[name] / float(problem.noise[name]) for name in problem.columns]

@@ -23,6 +23,7 @@ from ..estimate._prepare import (
     StartState,
     prepare,
     prepare_law,
+    step_changes,
 )
 from ..estimate._problem import AbstractLoss, SquaredLoss
 from ..estimate._search import Progress, SearchOptions, SearchResult, continued, solve_freed, solve_with_noise
@@ -270,12 +271,16 @@ def result_of(
         numbers={name: np.asarray(x) for name, x in scene_numbers(model).items()},
         model=model,
     )
+    changes = step_changes(search)
     diagnostics = FitDiagnostics(
         rmse=rmse,
         noise={name: float(x) for name, x in problem.noise.items()},
         ending=search.ending,
         evaluations=search.iterations,
-        step_moves=step_moves(search, entries, estimate.errors),
+        step_error={
+            name: np.sqrt(np.sum(x**2) / np.sum(search.residuals[name][1] > 0)).item() for name, x in changes.items()
+        },
+        step_moves=step_moves(problem, state, entries, estimate.errors, changes),
         starts=starts,
         single_precision=jnp.result_type(float) == jnp.float32,
         issues=(

@@ -33,8 +33,9 @@ _FOLLOWS = 0.9
 # Excess of the mean square error over the noise from sample to sample that is reported: at least this share, and so
 # many times one over the root of the number of samples, which is four standard deviations of the ratio.
 _EXCESS, _SCATTER = 0.2, 15.0
-# More integration steps are asked for where they move a parameter by this share of its standard error.
-_STEP_SHOWS = 0.5
+# More integration steps are asked for where they move a parameter by this share of its standard error, or the output by
+# this share of the RMSE: standard errors contain the error of the steps.
+_MOVES, _SHOWS, _TINY = 0.5, 0.1, 1e-300
 
 _KIND, _VERSION, _TEXT = "jaxmodsim fit result", 2, "result.json"
 _PARTS = {"estimate": ParameterEstimate, "diagnostics": FitDiagnostics, "provenance": FitProvenance}
@@ -198,6 +199,7 @@ class FitResult(AbstractReadable):
                 "correlation": {"names": list(estimate.values), "matrix": estimate.correlation.tolist()},
                 "evaluations": diagnostics.evaluations,
                 "ending": diagnostics.ending,
+                "step_error": diagnostics.step_error,
                 "step_moves": diagnostics.step_moves,
                 "warnings": list(warnings_for(self)),
             }
@@ -266,13 +268,26 @@ def warnings_for(result: FitResult) -> tuple[str, ...]:
 
 
 def is_step_size_limited(result: FitResult) -> bool:
-    """Whether four times as many integration steps would move a parameter by half of its standard error or more.
+    """Whether the error of the integration steps shows in a parameter or in the output.
+
+    Four times as many would move a parameter by half of its standard error, or a channel by a tenth of its RMSE.
 
     **Returns:**
 
     A `bool`.
     """
-    return max(result.diagnostics.step_moves.values(), default=0.0) > _STEP_SHOWS
+    return bool(_step_shows(result.diagnostics))
+
+
+def _step_shows(diagnostics: FitDiagnostics) -> str:
+    """What four times as many integration steps would move, in words; empty if that is little."""
+    moves = diagnostics.step_moves
+    shares = {name: x / max(diagnostics.rmse[name], _TINY) for name, x in diagnostics.step_error.items()}
+    if moves and (most := max(moves.values())) > _MOVES:
+        return f"{max(moves, key=moves.__getitem__)} moves by {most:.2g} standard errors"
+    if shares and (most := max(shares.values())) > _SHOWS:
+        return f"{max(shares, key=shares.__getitem__)} moves by {100 * most:.0f} % of its RMSE (root mean square)"
+    return ""
 
 
 def uncertain_of(estimate: ParameterEstimate) -> dict[str, tuple[str, ...]]:
@@ -289,12 +304,8 @@ def _of_the_search(result: FitResult) -> list[str]:
     diagnostics, sentences = result.diagnostics, []
     if not ended_by_itself(diagnostics.ending):
         sentences.append(f"The search {diagnostics.ending}: do not trust the standard errors.")
-    if is_step_size_limited(result):
-        name, moves = max(diagnostics.step_moves.items(), key=lambda item: item[1])
-        sentences.append(
-            f"The integration step shows: with four times as many, {name} moves by {moves:.2g} standard errors."
-            " Raise substeps."
-        )
+    if shows := _step_shows(diagnostics):
+        sentences.append(f"The integration step shows: with four times as many, {shows}. Raise substeps.")
     for channel, rmse in diagnostics.rmse.items():
         columns = _columns(result, channel)
         scatter = np.sqrt(np.mean(np.concatenate([x - np.mean(x) for x in columns]) ** 2)) if columns else 0.0

@@ -372,6 +372,10 @@ class EventSolver(AbstractSolverWrapper):
         # A guard whose root is at the start of a step fires if the step has the shortest length.
         here = here | (seen.crosses & (seen.root * length <= resolution) & (length <= shortest))
         passed = seen.crosses & ~here
+        earliest = first_root(seen, passed)
+        # No step ends closer to a root than the resolution of time.
+        at_end = (1.0 - earliest) * length <= resolution
+        here, passed = here | (passed & at_end), passed & ~at_end
         # Without a root inside the step, the next step ends at the next root, if the tangents show one.
         sight = jnp.min(jnp.where(seen.armed, seen.ahead, jnp.inf))
         missed = jnp.any(passed)
@@ -379,7 +383,7 @@ class EventSolver(AbstractSolverWrapper):
         fired = here & landed
         order = jnp.where(seen.ahead < jnp.inf, seen.ahead, seen.root - 1.0)  # a guard in rounding may not fall
         first = jnp.arange(fired.shape[0]) == jnp.argmin(jnp.where(fired, order, jnp.inf))
-        ahead = jnp.where(missed, first_root(seen, passed), 1.0 + jnp.maximum(sight, 0.0))
+        ahead = jnp.where(missed, earliest, 1.0 + jnp.maximum(sight, 0.0))
         coming = jnp.argmin(jnp.where(missed, jnp.where(passed, seen.root, jnp.inf), seen.ahead))
         next_end = self._policy.next_end(ahead, missed, (landing(ahead)[coming], divisor))
         return Landing(fired, first, order, missed, landed, landed, next_end, jnp.sum(jnp.where(first, near, 0.0)))
