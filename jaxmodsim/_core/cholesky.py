@@ -165,7 +165,7 @@ def _solve_few(
     rows = jnp.where(both, matrix, jnp.eye(rhs.shape[0], dtype=matrix.dtype))
     share = jnp.where(active, share, 0.0)
     first = jnp.sum(share * jnp.diagonal(rows))
-    weighted = _by_rows(share, rhs)
+    weighted = (rhs.T * share).T
     redundant = weighted / jnp.where(first > 0, first, 1.0)
     least = float(jnp.finfo(rows.dtype).eps) ** _REDUNDANT
     if rhs.shape[0] == 2:
@@ -179,17 +179,13 @@ def _solve_few(
         p, q, r = jnp.unstack(share)
         second = q * r * of_a + p * r * of_d + p * q * of_f
         two = second > least * first * first
-        rest = _by_rows(share, first * rhs - apply_matrix(rows, weighted)) / jnp.where(two, second, 1.0)
-        redundant = jnp.where(two, rest, redundant)
+        rest = ((first * rhs - apply_matrix(rows, weighted)).T * share).T
+        redundant = jnp.where(two, rest / jnp.where(two, second, 1.0), redundant)
     inverse = jnp.stack([jnp.stack(row) for row in cofactors])
     determinant = jnp.sum(rows[0] * inverse[0])
     # The square of the volume of the rows, each scaled to one.
     regular = determinant > least * size
     return jnp.where(regular, apply_matrix(inverse, rhs) * (1.0 / jnp.where(regular, determinant, 1.0)), redundant)
-
-
-def _by_rows(factors: Float[Array, " n"], x: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
-    return factors[:, None] * x if x.ndim == 2 else factors * x
 
 
 def solve_shifted(

@@ -26,14 +26,10 @@ _SMALL = 0.3
 
 def _rebound_series(number: int) -> np.ndarray:
     """Coefficients of `e` in powers of y, the highest first: `w = e y` satisfies `(1 + y) w w' = y (1 - w)`."""
-    w = np.zeros(number + 1)
-    w[1] = 1.0
-    squares = np.zeros(number + 1)  # 2 w w' in powers of y
-    squares[1] = 2.0
+    w, powers = np.eye(number + 1)[1], np.arange(number + 1)
     for k in range(2, number + 1):
-        inner = np.dot(w[2:k], w[k - 1 : 1 : -1])
-        w[k] = -(0.5 * (squares[k - 1] + (k + 1) * inner) + w[k - 1]) / (k + 1)
-        squares[k] = (k + 1) * (inner + 2.0 * w[k])
+        product = np.convolve(w, powers * w)  # y w w', in which w[k] is missing yet
+        w[k] = -(product[k + 1] + product[k] + w[k - 1]) / (k + 1)
     return w[:0:-1]
 
 
