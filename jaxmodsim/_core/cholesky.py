@@ -164,8 +164,8 @@ def _solve_few(
     both = active[:, None] & active[None, :]
     rows = jnp.where(both, matrix, jnp.eye(rhs.shape[0], dtype=matrix.dtype))
     share = jnp.where(active, share, 0.0)
-    first = jnp.sum(share * jnp.diagonal(rows))
-    weighted = (rhs.T * share).T
+    of_rows = share if rhs.ndim == 1 else share[:, None]
+    first, weighted = jnp.sum(share * jnp.diagonal(rows)), of_rows * rhs
     redundant = weighted / jnp.where(first > 0, first, 1.0)
     least = float(jnp.finfo(rows.dtype).eps) ** _REDUNDANT
     if rhs.shape[0] == 2:
@@ -179,7 +179,7 @@ def _solve_few(
         p, q, r = jnp.unstack(share)
         second = q * r * of_a + p * r * of_d + p * q * of_f
         two = second > least * first * first
-        rest = ((first * rhs - apply_matrix(rows, weighted)).T * share).T
+        rest = of_rows * (first * rhs - apply_matrix(rows, weighted))
         redundant = jnp.where(two, rest / jnp.where(two, second, 1.0), redundant)
     inverse = jnp.stack([jnp.stack(row) for row in cofactors])
     determinant = jnp.sum(rows[0] * inverse[0])

@@ -340,9 +340,8 @@ def project(
 ) -> tuple[PerDof, PerDof]:
     """Project coordinates and velocities onto the constraints, by least changes in the metric of the mass matrix.
 
-    Two steps of Newton's method change the coordinates, both with the mass matrix and the Jacobian of their start; then
-    the smallest impulses change the velocities. Errors that are small, as those of a step, are left with their third
-    power in the coordinates, and with the product of both in the velocities.
+    Two steps of Newton's method change the coordinates, then two the velocities by the smallest impulses, all with the
+    mass matrix and the Jacobian of the start. Of errors that are small, as those of a step, the third power is left.
 
     **Returns:**
 
@@ -351,14 +350,14 @@ def project(
     error = errors(constraints, t, params)
     rows = _jacobian(error, q)
     minv_jt, matrix = _mobility(rows, mass)
-    if rows.size:
-        for _ in range(_NEWTON):
-            q = q - jnp.sum(minv_jt * solve_balanced(matrix, error(q))[:, None], axis=0)
+    for _ in range(_NEWTON if rows.size else 0):
+        q = q - jnp.sum(minv_jt * solve_balanced(matrix, error(q))[:, None], axis=0)
     rate = rates(constraints, t, q, params)
-    change = rate(qd)
-    if change.shape != rows.shape[:1]:  # not all constraints are holonomic
+    if jax.eval_shape(rate, qd).shape != rows.shape[:1]:  # not all constraints are holonomic
         minv_jt, matrix = _mobility(_jacobian(rate, qd), mass)
-    return q, qd - jnp.sum(minv_jt * solve_balanced(matrix, change)[:, None], axis=0)
+    for _ in range(_NEWTON):
+        qd = qd - jnp.sum(minv_jt * solve_balanced(matrix, rate(qd))[:, None], axis=0)
+    return q, qd
 
 
 def constraint_residual(
