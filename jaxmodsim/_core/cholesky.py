@@ -105,7 +105,7 @@ _REFINEMENTS = 2
 
 def solve_balanced(matrix: Float[Array, "n n"], rhs: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
     """`solve_semidefinite` with all rows active and with weights that scale every diagonal entry to one."""
-    diagonal = jnp.diagonal(matrix)
+    diagonal = jnp.stack([jnp.unstack(row)[i] for i, row in enumerate(jnp.unstack(matrix))])  # see `_solve_few`
     weight = 1.0 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0))
     return solve_semidefinite(matrix, rhs, weight, jnp.ones(diagonal.shape, bool))
 
@@ -162,30 +162,30 @@ def _solve_few(
     - `share`: squares of the weights.
     """
     both = active[:, None] & active[None, :]
-    rows = jnp.where(both, matrix, jnp.eye(rhs.shape[0], dtype=matrix.dtype))
+    matrix = jnp.where(both, matrix, jnp.eye(rhs.shape[0], dtype=matrix.dtype))
     share = jnp.where(active, share, 0.0)
     of_rows = share if rhs.ndim == 1 else share[:, None]
-    first, weighted = jnp.sum(share * jnp.diagonal(rows)), of_rows * rhs
-    redundant = weighted / jnp.where(first > 0, first, 1.0)
-    least = float(jnp.finfo(rows.dtype).eps) ** _REDUNDANT
+    weighted, least = of_rows * rhs, float(jnp.finfo(matrix.dtype).eps) ** _REDUNDANT
+    # Indices would become scattered sums in reverse mode, which took three times as long as the rest of a step.
+    rows, parts = [jnp.unstack(row) for row in jnp.unstack(matrix)], jnp.unstack(share)
     if rhs.shape[0] == 2:
-        (a, b), (_, d) = map(jnp.unstack, rows)
-        cofactors, size = [[d, -b], [-b, a]], a * d
+        ((a, b), (_, d)), (p, q) = rows, parts
+        cofactors, determinant, size, first = [[d, -b], [-b, a]], a * d - b * b, a * d, p * a + q * d
+        redundant = weighted / jnp.where(first > 0, first, 1.0)
     else:
-        (a, b, c), (_, d, e), (_, _, f) = map(jnp.unstack, rows)
+        ((a, b, c), (_, d, e), (_, _, f)), (p, q, r) = rows, parts
         of_b, of_c, of_e = c * e - b * f, b * e - c * d, b * c - a * e
         of_a, of_d, of_f = d * f - e * e, a * f - c * c, a * d - b * b
-        cofactors, size = [[of_a, of_b, of_c], [of_b, of_d, of_e], [of_c, of_e, of_f]], a * d * f
-        p, q, r = jnp.unstack(share)
+        cofactors = [[of_a, of_b, of_c], [of_b, of_d, of_e], [of_c, of_e, of_f]]
+        determinant, size, first = a * of_a + b * of_b + c * of_c, a * d * f, p * a + q * d + r * f
         second = q * r * of_a + p * r * of_d + p * q * of_f
         two = second > least * first * first
-        rest = of_rows * (first * rhs - apply_matrix(rows, weighted))
-        redundant = jnp.where(two, rest / jnp.where(two, second, 1.0), redundant)
-    inverse = jnp.stack([jnp.stack(row) for row in cofactors])
-    determinant = jnp.sum(rows[0] * inverse[0])
+        rest = of_rows * (first * rhs - apply_matrix(matrix, weighted)) / jnp.where(two, second, 1.0)
+        redundant = jnp.where(two, rest, weighted / jnp.where(first > 0, first, 1.0))
     # The square of the volume of the rows, each scaled to one.
     regular = determinant > least * size
-    return jnp.where(regular, apply_matrix(inverse, rhs) * (1.0 / jnp.where(regular, determinant, 1.0)), redundant)
+    inverse = jnp.stack([jnp.stack(row) for row in cofactors])
+    return jnp.where(regular, apply_matrix(inverse, rhs) / jnp.where(regular, determinant, 1.0), redundant)
 
 
 def solve_shifted(
