@@ -262,7 +262,12 @@ def odd(result) -> FitResult:
     return replace(
         result,
         estimate=replace(result.estimate, covariance=covariance),
-        diagnostics=replace(result.diagnostics, step_error={"measured": 0.1 + 0.2}, step_moves={}, issues=issues),
+        diagnostics=replace(
+            result.diagnostics,
+            step_error=dict.fromkeys(result.diagnostics.rmse, 0.1 + 0.2),
+            step_moves={},
+            issues=issues,
+        ),
     )
 
 
