@@ -107,6 +107,16 @@ def test_an_input_out_of_range_between_events_of_model_exchange_is_refused(tmp_p
     one.freeInstance()
 
 
+def stepping(path: Path) -> tuple[Any, dict[str, int]]:
+    """An instance in step mode that returns at events, with the tolerance 1e-9; and the references of its variables."""
+    one, place, _ = opened("FMU3Slave", path, eventModeUsed=True, earlyReturnAllowed=True)
+    one.enterInitializationMode(tolerance=1e-9, startTime=0.0)
+    one.exitInitializationMode()
+    one.updateDiscreteStates()
+    one.enterStepMode()
+    return one, place
+
+
 @needs_fmpy
 def test_a_contact_that_opens_without_restitution_stays_open(tmp_path: Path) -> None:
     """The velocity of its gap is rounding, of either sign: it closed again, and a step never ended."""
@@ -121,11 +131,7 @@ def test_a_contact_that_opens_without_restitution_stays_open(tmp_path: Path) -> 
     path = jms.export.fmu(
         scene, [-0.019056054820276398], [-0.471320541735349], tmp_path / "stops.fmu", inputs=["u"], platforms=[OWN]
     )
-    one, place, _ = opened("FMU3Slave", path, eventModeUsed=True, earlyReturnAllowed=True)
-    one.enterInitializationMode(tolerance=1e-9, startTime=0.0)
-    one.exitInitializationMode()
-    one.updateDiscreteStates()
-    one.enterStepMode()
+    one, place = stepping(path)
     times, t = [], 0.0
     for end, load in ((1.0, 0.42603236), (2.0, -1.86381767), (3.0, -0.28214342), (4.0, 0.0)):
         while t < end and len(times) < 50:
@@ -153,11 +159,7 @@ def test_a_long_step_out_of_stick_ends_on_the_first_break_away(tmp_path: Path) -
         (jms.Friction(jms.Coulomb(1.453988632396544), belt_velocity=-0.17848703676370337),),
     )
     path = jms.export.fmu(scene, [-0.20360879473492388], [-0.17848703676370337], tmp_path / "m.fmu", platforms=[OWN])
-    one, place, _ = opened("FMU3Slave", path, eventModeUsed=True, earlyReturnAllowed=True)
-    one.enterInitializationMode(tolerance=1e-9, startTime=0.0)
-    one.exitInitializationMode()
-    one.updateDiscreteStates()
-    one.enterStepMode()
+    one, place = stepping(path)
     times, t = [], 0.0
     while t < 3.0:
         event, _, _, t = one.doStep(t, 3.0 - t)
