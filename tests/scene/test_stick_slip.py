@@ -338,15 +338,7 @@ def test_bouncing_ball_comes_to_rest_where_it_may() -> None:
     assert float(solution.ys.status[-1]) == 0.0
 
 
-@pytest.mark.parametrize(
-    "dtype",
-    [
-        pytest.param(
-            "float32", marks=pytest.mark.xfail(reason="2 of 600 fall where flights last less than time resolves")
-        ),
-        "float64",
-    ],
-)
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_no_bouncing_ball_falls_through_the_floor(dtype: str) -> None:
     """The last bounces are so low that they are rounding, however large the steps are that look for the next one."""
     es = jnp.linspace(0.05, 0.9, 60).astype(dtype)

@@ -112,6 +112,9 @@ def pass_event(
         here = landed.on_root & reach & _constant(t + newton >= landed.earliest)
         on_root = jnp.where(i == 0, here, place.on_root)
         newton = jnp.where(on_root, newton, 0.0)
+        # In a flight that time hardly resolves the rate changes on the way, and the second step would lead back.
+        diverges = at_root & (jnp.abs(_constant(newton)) > jnp.abs(_constant(place.way)))
+        newton = jnp.where(diverges, newton - _constant(newton), newton)
         way = jnp.where(i == 0, jnp.where(landed.chained & ~here, back, newton), place.way)
         whole = way + newton
         whole = jnp.where(_constant(landed.t + whole < landed.earliest), back, whole)
