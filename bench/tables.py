@@ -286,8 +286,8 @@ REPORTS = {
             "Five scenes as FMUs in FMPy at rtol {rtol:g}, against `simulate` at 1e-10: largest error of the"
             " coordinates in co-simulation and in model exchange (by CVODE of FMPy), and of event times in"
             " co-simulation; median time of a step of 1 ms, the call from Python included; processor time"
-            " to write the FMU, compilation excluded.",
-            ("error of coordinates", "events", "error of event times", "step of 1 ms", "export"),
+            " to write the FMU, compilation excluded. Events of an FMU include changes of a guide's side.",
+            ("error of coordinates", "events", "events of the run", "error of event times", "step of 1 ms", "export"),
             ("case", "at"),
         ),),
     ),

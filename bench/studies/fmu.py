@@ -72,12 +72,13 @@ def _errors(result: Result, name: str, path: Path, run: Any, t1: float) -> None:
             one.updateDiscreteStates()
             one.enterStepMode()
             times.append(t)
-    expected = np.sort(np.asarray(run.events.t)) if run.events is not None else np.zeros(0)
+    expected = np.asarray(run.events.t) if run.events is not None else np.zeros(0)
     result.add("events", float(len(times)), "1", case=name)
-    if len(times) == len(expected) and len(times):
-        result.add("error of event times", float(np.max(np.abs(times - expected))), "s", case=name)
-    elif len(times) != len(expected):
-        result.add("error of event times", f"failed: {len(expected)} events expected", "s", case=name)
+    result.add("events of the run", float(len(expected)), "1", case=name)
+    if len(expected):
+        # An FMU has more: it also counts the changes of a guide's side, at which no mode changes.
+        apart = np.abs(np.asarray(times)[:, None] - expected).min(axis=0)
+        result.add("error of event times", float(np.max(apart)), "s", case=name)
     one.freeInstance()
     if name == "belt":
         result.add("step of 1 ms", _step_time(_instance(path)), "s", case=name)
