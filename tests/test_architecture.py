@@ -21,14 +21,14 @@ FILES = sorted(ROOT.rglob("*.py"))
 # never in the wheel. Rooms are in the order of their imports: a room imports only rooms above it, imports for type
 # checkers included; what it takes from another room is among that room's public names. `_core` has none: all of it is
 # private to the package. The number is the budget of lines of a room: to raise it is a decision, whose commit says why.
-CORE = {"_core": 3386, "mechanics": 1598, "friction": 3015, "scene": 3906, "solvers": 4156, "simulation": 3229}
+CORE = {"_core": 3386, "mechanics": 1598, "friction": 3015, "scene": 3907, "solvers": 4156, "simulation": 3229}
 APPLICATIONS = {
     "metrics": 633,
     "analysis": 2136,
     "orbits": 3122,
     "identify": 9622,
     "sweeps": 2093,
-    "export": 1909,
+    "export": 1910,
     "control": 790,
     "problems": 2835,
     "plot": 1715,

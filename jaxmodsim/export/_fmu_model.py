@@ -19,7 +19,7 @@ from ..solvers import RODAS5P
 from ._c_code import unused, write_function
 
 # Arguments of the functions: scalars, and arrays that a function reads or changes in place.
-_READ = {x: f"double {x}" for x in ("t", "along", "dense")}
+_READ = {x: f"double {x}" for x in ("t", "along", "dense", "least")}
 _READ |= {x: f"const double *{x}" for x in ("p", "y", "m", "tol", "fired", "dp", "dy", "seed")}
 
 
@@ -122,10 +122,10 @@ class Model(NamedTuple):
         return start(t, y, p, m, tol[0]) if self.modes else (y, m)
 
     def after(
-        self, t: Array, p: Scene, tol: Array, fired: Array, dense: Array, y: State, m: Array
+        self, t: Array, p: Scene, tol: Array, fired: Array, dense: Array, least: Array, y: State, m: Array
     ) -> tuple[State, Array]:
-        """State and modes after the guards that fired; dense: whether impacts accumulate."""
-        y, m, touching = switch(t, y, p, m, fired > 0, tol[0], dense > 0, False)
+        """State and modes after the guards that fired; dense: whether impacts accumulate; least: a rebound's height."""
+        y, m, touching = switch(t, y, p, m, fired > 0, tol[0], dense > 0, False, least)
         return self.on_constraints(t, p, y, touching) if p.contacts else y, m
 
 
@@ -170,7 +170,7 @@ def write_model(model: Model) -> tuple[str, str]:
     - `ValueError` naming an unsupported operation of JAX, and the function that needs it.
     """
     like = {"t": 0.0, "along": 0.0, "p": model.scene, "y": model.y, "m": model.mode, "fired": model.mode}
-    like |= {"dp": model.scene, "dy": model.y, "tol": jnp.zeros(3), "dense": 0.0}
+    like |= {"dp": model.scene, "dy": model.y, "tol": jnp.zeros(3), "dense": 0.0, "least": 0.0}
     outputs = sum(int(np.prod(shape)) for shape in series_of(model).values())
     like["seed"] = jnp.zeros(_size(model.y) + model.modes + outputs)
     prototypes, functions = [], []
@@ -215,6 +215,7 @@ def header(
     outputs = sum(int(np.prod(shape)) for shape in series_of(model).values())
     sizes = {"NUMBERS": len(numbers), "STATES": len(states), "MODES": model.modes, "THINGS": len(widths)}
     sizes |= {"EVALUATED": len(states) + model.modes + outputs, "CONTACTS": len(model.scene.contacts)}
+    sizes["SLIPS"] = model.scene.split_modes(model.mode)[0].size
     requirements = model.requirements
     sizes |= {"RANGES": len(requirements), "PROJECTS": int(model.projects), "GAMMA": repr(RODAS5P.gamma)} | defined
     lines = [f"#define {name} {value}" for name, value in sizes.items()]

@@ -461,6 +461,8 @@ fmi3Status fmi3GetEventIndicators(fmi3Instance instance, fmi3Float64 indicators[
   if (!usable(c)) return fmi3Error;
   model_guards(s->t, s->numbers, s->y, s->mode, c->motion.tolerances, c->motion.guards[0]);
   memcpy(indicators, c->motion.guards[0], MODES * sizeof(double));
+  /* A gap that has just opened is smaller than the errors of an importer, whose sign is no event. */
+  for (int i = SLIPS; i < SLIPS + CONTACTS; ++i) indicators[i] += c->motion.guards[0][MODES + i];
 #endif
   return fmi3OK;
 }

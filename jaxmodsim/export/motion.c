@@ -258,7 +258,9 @@ static double look(Motion *c, double h, double *factor, int *first) {
       }
     }
     int high = !c->s.waits[i] || (c1 > 0.0 && v[0] >= -ZERO * c1);
-    if (!c->s.waits[i] && v[0] <= 0.0 && v[1] < 0.0 && c1 <= 0.0) {
+    /* An input that jumps may leave a guard violated that rises again within the step. */
+    const int violated = v[0] < -c->guards[0][MODES + i] || (v[0] <= 0.0 && v[1] < 0.0 && c1 <= 0.0);
+    if (!c->s.waits[i] && violated) {
       earliest = 0.0, *first = i;
       continue;
     }
@@ -355,21 +357,24 @@ int motion_fire(Motion *c) {
     const double since = s->t - s->last;
     double y[STATES], mode[MODES];
     s->spread = s->resets == 0 ? since : larger(since, FORGET * s->spread);
-    const double unit = c->coarse ? larger(s->rtol, DBL_EPSILON) : DBL_EPSILON;
-    const double vanishes = larger(ACCUMULATION * sqrt(unit) * (s->t - s->begin), 64.0 * DBL_EPSILON * fabs(s->t));
-    const int dense = s->resets >= FEWEST && s->spread <= vanishes;
-    if (dense && (!CONTACTS || (s->resets > TRIALS && s->spread == 0.0))) {
+    const double vanishes = larger(ACCUMULATION * sqrt(DBL_EPSILON) * (s->t - s->begin), 64.0 * DBL_EPSILON * fabs(s->t));
+    int strikes = 0;
+    for (int i = SLIPS; i < SLIPS + CONTACTS; ++i) strikes |= s->fired[i] != 0.0;
+    s->alone = strikes ? 0 : s->alone + 1;
+    const int accumulate = s->resets >= FEWEST && s->spread <= vanishes, dense = accumulate && strikes;
+    if (accumulate && (s->alone > FEWEST || (s->resets > TRIALS && s->spread == 0.0))) {
       c->failure = "events accumulate: modes switch again and again without time between (chatter)";
       return 0;
     }
     memcpy(y, s->y, sizeof y), memcpy(mode, s->mode, sizeof mode);
-    model_switch(s->t, s->numbers, c->tolerances, s->fired, dense, s->y, s->mode);
+    /* An importer does not resolve a rebound below its tolerance. */
+    model_switch(s->t, s->numbers, c->tolerances, s->fired, dense, c->coarse ? s->atol : 0.0, s->y, s->mode);
     if (CONTACTS && (memcmp(mode, s->mode, sizeof mode) || memcmp(y, s->y, sizeof y))) motion_project(c, s->y);
     ++s->resets, s->last = s->t, c->linearised = 0;
     if (dense) {
       double g[3 * MODES];
       model_guards(s->t, s->numbers, s->y, s->mode, c->tolerances, g);
-      for (int i = 0; i < MODES; ++i) s->waits[i] = g[i] <= 0.0;
+      for (int i = SLIPS; i < SLIPS + CONTACTS; ++i) s->waits[i] = g[i] <= 0.0;
     } else memset(s->waits, 0, sizeof s->waits);
     motion_due(c, 0.0);
   }

@@ -15,7 +15,8 @@ typedef struct {
   double back;                /* time from the instant of an importer to the root of the event there */
   double fired[SPACE(MODES)]; /* guards whose event is pending */
   int32_t waits[SPACE(MODES)]; /* guards that must be positive before they fire */
-  int32_t resets, pending, changed, moved, phase;
+  int32_t resets, alone; /* events, and those since the last one of a contact */
+  int32_t pending, changed, moved, phase;
 } State;
 
 typedef struct {

@@ -83,12 +83,13 @@ def switch(
     rest: Scalar,
     dense: Bool[Array, ""],
     holds: bool,
+    least: Scalar | float = 0.0,
 ) -> tuple[State, Float[Array, " modes"], Float[Array, " modes"]]:
     """State and modes after the guards that `fired`.
 
-    Where events accumulate (`dense`) struck contacts close without a rebound. Friction elements that fired there stick
-    regardless of their limits if chatter is held (`holds`), and keep their modes otherwise. A closed contact that would
-    pull opens at the same instant, so that its time has the derivative of this event.
+    Struck contacts close without a rebound where events accumulate (`dense`), or if it rises by less than `least` [m].
+    Friction elements that fired where events accumulate stick regardless of their limits if chatter is held (`holds`),
+    and keep their modes otherwise. A closed contact that would pull opens at once, so that its time has the derivative.
 
     The impact and the friction after it are two functions of `in_scalars`, as one would be too large for it.
 
@@ -111,7 +112,7 @@ def switch(
 
     if not holds:
         slip_fired = slip_fired & ~dense
-    bounces = _bounces(t, y, scene, _join(slips, closed, sides))
+    bounces = _bounces(t, y, scene, _join(slips, closed, sides), least)
 
     def strike(t: Array, q: Array, qd: Array) -> tuple[Array, Array, Array]:
         return impact(t, q, qd, scene.bind_state(t, q, qd), closed, contact_fired, rest, bounces, dense)
@@ -129,7 +130,7 @@ def switch(
     return after, _join(slips, jnp.where(pulls, 0.0, closed), sides), _join(slips, closed, sides)
 
 
-def _bounces(t: Scalar, y: State, scene: Scene, mode: Float[Array, " modes"]) -> Bool[Array, " contacts"]:
+def _bounces(t: Scalar, y: State, scene: Scene, mode: Array, least: Scalar | float) -> Bool[Array, " contacts"]:
     """Which contacts rebound: those that are closed already, and those whose rebound is resolved.
 
     After a rebound with the velocity w a gap that accelerates by a < 0 is at most `w^2/(2 |a|)` wide, and closes after
@@ -143,9 +144,9 @@ def _bounces(t: Scalar, y: State, scene: Scene, mode: Float[Array, " modes"]) ->
     def look(contact: Contact, d: Dynamics) -> Bool[Array, ""]:
         (t, q, qd), params = (d.t, d.y.q, d.y.qd), d.scene.params
         w, a = jax.jvp(lambda t, q, qd: contact.rate(t, q, qd, params)[0], (t, q, qd), (jnp.ones_like(t), qd, d.qdd))
-        gap = contact.rounding(t, q, params)
+        gap = jnp.maximum(_RESOLVED * contact.rounding(t, q, params), least)
         w, pull = contact.coefficient * jnp.abs(w), jnp.maximum(-a, 0.0)
-        return (w * w >= 2.0 * _RESOLVED * gap * pull) & (2.0 * w >= shortest * pull)
+        return (w * w >= 2.0 * gap * pull) & (2.0 * w >= shortest * pull)
 
     contacts = tuple(scene.contacts.values())
     resolved = from_dynamics(lambda d: jnp.stack([look(each, d) for each in contacts]), *held)

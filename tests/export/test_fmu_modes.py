@@ -173,3 +173,63 @@ def test_a_long_step_out_of_stick_ends_on_the_first_break_away(tmp_path: Path) -
     np.testing.assert_allclose(times, exact, atol=1e-8, rtol=0)
     assert one.getFloat64([place["q[0]"]]) == pytest.approx([-0.10962611], abs=1e-8)
     one.freeInstance()
+
+
+@needs_fmpy
+def test_a_jump_of_an_input_breaks_stick_although_the_load_falls_back_within_the_step(tmp_path: Path) -> None:
+    """The load exceeds the limit at the beginning of a step alone: the mass did not move, but for 0.229 m."""
+    scene = jms.Scene(
+        lambda t, q, qd, p: 0.5 * qd[0] ** 2,
+        {"pull": 0.0},
+        (jms.AppliedForce(lambda t, q, qd, p: (p["pull"] - t)[None]), jms.Friction(jms.Coulomb(1.0, 1.5))),
+    )
+    path = jms.export.fmu(scene, [0.0], [0.0], tmp_path / "cart.fmu", inputs=["pull"], platforms=[OWN])
+    one, place, _ = opened("FMU3Slave", path)
+    one.enterInitializationMode(tolerance=1e-9, startTime=0.0)
+    one.exitInitializationMode()
+    one.doStep(0.0, 1.0)
+    one.setFloat64([place["pull"]], [2.7])
+    one.doStep(1.0, 2.0)
+    # v = 0.7 s - s^2/2 for s = t - 1, until v = 0.
+    assert one.getFloat64([place["q[0]"], place["qd[0]"]]) == pytest.approx([1.4**3 / 12.0, 0.0], abs=1e-9)
+    one.freeInstance()
+
+
+@needs_fmpy
+def test_an_importer_does_not_lose_a_contact_whose_last_rebounds_it_does_not_resolve(tmp_path: Path) -> None:
+    """The sign of its errors in a gap was an event, and the next fall none: for a while friction did not act."""
+    floor = jms.Contact(lambda t, q, p: q[1], restitution=0.5, name="floor")
+    rubs = jms.Friction(jms.Coulomb(0.25), along=lambda q: q[0], normal_force="floor")
+    scene = jms.Scene(lambda t, q, qd, p: 0.5 * jnp.sum(qd**2) - 4.0 * q[1], {}, (rubs,), constraints=(floor,))
+    path = jms.export.fmu(scene, [0.0, 0.5], [2.0, 0.0], tmp_path / "puck.fmu", platforms=[OWN])
+    for restitution in (0.15, 0.4):
+        rows = fmpy.simulate_fmu(
+            str(path),
+            fmi_type="ModelExchange",
+            stop_time=3.0,
+            output_interval=0.2,
+            relative_tolerance=1e-7,
+            start_values={"floor.restitution": restitution},
+        )
+        # A series of parabolas with impulses of friction between them, then sliding: the same for all restitutions.
+        assert [rows["q[0]"][-1], rows["q[1]"][-1]] == pytest.approx([2.125, 0.0], abs=1e-5)
+
+
+@needs_fmpy
+def test_chatter_is_an_error_in_a_scene_with_a_contact_elsewhere(tmp_path: Path) -> None:
+    """Only impacts that accumulate leave their contact closed: the switch kept its side, and the mass was lost."""
+    push = jms.Switch(
+        lambda t, q, qd, p: q[0] + qd[0],
+        above=lambda t, q, qd, p: -2.0 + 0.0 * q,
+        below=lambda t, q, qd, p: 2.0 + 0.0 * q,
+    )
+    far = jms.Contact(lambda t, q, p: q[0] + 100.0, name="far")
+    scene = jms.Scene(lambda t, q, qd, p: 0.5 * qd[0] ** 2, {}, (push,), constraints=(far,))
+    path = jms.export.fmu(scene, [1.0], [0.0], tmp_path / "push.fmu", platforms=[OWN])
+    one, _, said = opened("FMU3Slave", path)
+    one.enterInitializationMode(tolerance=1e-6, startTime=0.0)
+    one.exitInitializationMode()
+    with pytest.raises(Exception, match="fmi3DoStep failed"):
+        one.doStep(0.0, 4.0)
+    assert b"chatter" in said[-1]
+    one.freeInstance()
