@@ -96,8 +96,8 @@ def simulate(
     - `max_steps`: limit of the number of steps. Derivatives reserve memory for the state before each of them.
     - `max_events`: limit of the number of instants at which set-valued laws change modes. Inside `jax.jit`, and with
       recorded events, `run.events` has this number of entries for each such law, so that a smaller one is faster.
-    - `stick_on_chatter`: whether an element whose mode changes accumulate stays in stick, by any force, even above its
-      limit, instead of ending the run.
+    - `stick_on_chatter`: whether a friction element whose mode changes accumulate stays in stick, by any force, even
+      above its limit, instead of ending the run.
     - `project`: whether the state is projected onto the constraints after every step, and when it is saved, by the
       smallest changes in the metric of the masses. Without it, constraints hold for the accelerations alone, and drift
       with the error of integration, apart from their own `stabilise`.

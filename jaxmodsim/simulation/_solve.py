@@ -135,7 +135,7 @@ def _solver(
             solver,
             functions.guards,
             functions.reset,
-            carries_on=request.choices.stick_on_chatter or bool(scene.contacts),
+            carries_on=_carried_on(request),
             project=functions.project_and_stick if functions.projects or functions.sticks else None,
             samples=samples,
             rtol=functions.tolerances[0],
@@ -149,6 +149,13 @@ def _solver(
     if functions.projects or freeze_args is not None:
         return Projected(solver, functions.project if functions.projects else None, freeze_args)
     return solver
+
+
+def _carried_on(request: RunRequest) -> tuple[bool, ...]:
+    """Which guards may fire again and again without time between: impacts, and friction where chatter is held."""
+    scene, modes = request.scene, request.scene.num_modes(request.q0.shape[0])
+    contacts, sides = len(scene.contacts), len(scene.switches) + scene.num_kinks
+    return (request.choices.stick_on_chatter,) * (modes - contacts - sides) + (True,) * contacts + (False,) * sides
 
 
 def _step_from(t: Array, scene: Scene) -> Scene:

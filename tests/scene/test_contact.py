@@ -9,7 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmodsim import AppliedForce, Coulomb, Friction, LuGre, Regularized, Scene, SimulationError, Stribeck, simulate
+from jaxmodsim import (
+    AppliedForce,
+    Contact,
+    Coulomb,
+    Friction,
+    LuGre,
+    Regularized,
+    Scene,
+    SimulationError,
+    Stribeck,
+    simulate,
+)
 from jaxmodsim.scene._event_driven import FrictionElements, next_modes, solve_friction_forces
 from jaxmodsim.simulation._solve import compiled_runs
 
@@ -201,6 +212,9 @@ def test_chatter_is_named_or_held() -> None:
     law = scene(Friction(Contradictory(), name="pad"), r=1.0)
     with pytest.raises(SimulationError, match=r"mode changes of 'pad' accumulate: chatter.*stopped at t = 1"):
         simulate(law, [0.0], [0.0], 1.8, ts=np.array([0.5, 1.5]))
+    beside = Scene(law.lagrangian, law.params, law.effects, (Contact(lambda t, q, p: q[0] + 9.0),))
+    with pytest.raises(SimulationError, match=r"mode changes of 'pad' accumulate: chatter.*stopped at t = 1"):
+        simulate(beside, [0.0], [0.0], 1.8)
     early = simulate(law, [0.0], [0.0], 1.8, ts=np.array([0.5, 1.5]), throw=False)
     assert not early.result.ok
     # The step before ends on the event to 1e-5 of its length.

@@ -285,9 +285,12 @@ def test_forces_that_push_back_from_both_sides_are_named():
         below=lambda t, q, qd, p: jnp.ones(1),
         name="relay",
     )
-    scene = jms.Scene(lagrangian, params={"m": 1.0}, effects=(relay,))
-    with pytest.raises(jms.SimulationError, match=r"crossings of 'relay' accumulate.*sliding mode"):
-        jms.simulate(scene, [0.1], [0.0], 10.0)
+    far = jms.Contact(lambda t, q, p: q[0] + 100.0)
+    # Impacts may accumulate, and friction may be held: neither is a reason to keep the side of a switch.
+    for contacts, held in (((), False), ((), True), ((far,), False)):
+        scene = jms.Scene(lagrangian, {"m": 1.0}, (relay,), contacts)
+        with pytest.raises(jms.SimulationError, match=r"crossings of 'relay' accumulate.*sliding mode"):
+            jms.simulate(scene, [0.1], [0.0], 10.0, stick_on_chatter=held)
 
 
 @pytest.mark.quick

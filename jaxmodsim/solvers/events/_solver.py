@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from ..._core.arrays import Real, fusion_barrier, opaque_one
@@ -114,8 +115,8 @@ class EventSolver(AbstractSolverWrapper):
 
     **Accumulation of events** (a ball that comes to rest, chatter): if the last intervals between events fall below
     1e-3 sqrt(eps) of the time since the start, the run ends with `status = 1` in the state and diffrax's result
-    `dt_min_reached`. With `carries_on` it goes on: `reset` finds `s.dense` true there, and guards that are not
-    positive after it wait. After `max_events` events the next one ends the run with `status = 2` and
+    `dt_min_reached`. Where guards of `carries_on` fire it goes on: `reset` finds `s.dense` true there, and those that
+    are not positive after it wait. After `max_events` events the next one ends the run with `status = 2` and
     `max_steps_reached`.
 
     **Arguments:**
@@ -128,7 +129,7 @@ class EventSolver(AbstractSolverWrapper):
       before it, within the resolution of time.
     - `reset`: `reset(t, s, args, fired)` -> `s` with another `y` or `mode` (by `s._replace`); `fired` are booleans,
       shape `[guards]`.
-    - `carries_on`: whether the run goes on where events accumulate, which `reset` finds in `s.dense`.
+    - `carries_on`: whether the run goes on where events accumulate, for all guards or one flag for each.
     - `project`: `project(t, s, args)` -> `s`, applied after every step, for invariants that drift.
     - `enforce`: whether the guards are conditions that have to hold, instead of crossings.
     - `samples`: a `SampledJumps` if `args` hold sampled values.
@@ -189,7 +190,7 @@ class EventSolver(AbstractSolverWrapper):
     dtmin: Real = 0.0
     event_mode: Callable[[PyTree], PyTree] | None = None
     at_event: Callable[..., tuple[PyTree, Array]] | None = None
-    carries_on: bool = eqx.field(default=False, static=True)
+    carries_on: bool | tuple[bool, ...] = eqx.field(default=False, static=True)
     enforce: bool = eqx.field(default=False, static=True)
     max_events: int = eqx.field(default=128, static=True)
     log: int | None = eqx.field(default=None, static=True)
@@ -257,7 +258,7 @@ class EventSolver(AbstractSolverWrapper):
         inner = self.solver.init(dfx.ODETerm(_Field(terms)), t0, t1, y0.y, (y0, args))
         guard, first = self._guards(*_held((t0, y0, args))), _constant(t1 - t0)
         none, armed = jnp.zeros((), int), self._policy.armed_at_start(guard)
-        return inner, EventMemory(guard, armed, none, jnp.zeros_like(first), first, _constant(t0 - (t1 - t0)))
+        return inner, EventMemory(guard, armed, none, none, jnp.zeros_like(first), first, _constant(t0 - (t1 - t0)))
 
     def step(
         self, terms: PyTree, t0: Real, t1: Real, y0: EventState, args: PyTree, solver_state: PyTree, made_jump: Real
@@ -412,6 +413,7 @@ class EventSolver(AbstractSolverWrapper):
         new_args = whole if self.samples is None else self.samples.freeze_args(t, whole)
         # An event within no distance is at a jump of the samples: the way back from it is before the jump.
         back = choose(near == 0, args, new_args)
+        carries = np.asarray(self.carries_on)
         both = self.at_event or (lambda *at: (terms.vf(*at).y, self._guards(*at)))
 
         def evaluate(t: Array, y: PyTree, mode: PyTree, args: PyTree) -> tuple[PyTree, Array]:
@@ -425,7 +427,7 @@ class EventSolver(AbstractSolverWrapper):
             rate = jnp.where(rate == 0, 1.0, rate)
 
             def reset(t_event: Array, y: PyTree) -> tuple[PyTree, PyTree]:
-                dense = _spread(t_event, state.t, memory)[1] & self.carries_on
+                dense = _spread(t_event, state.t, memory)[1] & jnp.any(fires & carries)
                 after = self.reset(t_event, here._replace(y=y, dense=dense), whole, fires)
                 return after.y, after.mode
 
@@ -439,9 +441,11 @@ class EventSolver(AbstractSolverWrapper):
 
         passage, each, (rate, early) = in_turn(way, (t, state.y, state.mode, memory.guard), landing, near)
         t_event, values, (y, mode, slope) = passage.t, passage.guards, passage.after
-        spread, dense = _spread(t_event, state.t, memory)
-        ends = dense & (not self.carries_on)
-        status = jnp.where(ends, jnp.asarray(ACCUMULATION, spread.dtype), ONGOING)
+        spread, vanishes = _spread(t_event, state.t, memory)
+        carried = jnp.any(fired & carries)
+        # Impacts that accumulate may have other events between them, but not several on end.
+        alone = jnp.where(carried, 0, memory.alone + 1)
+        status = jnp.where(vanishes & (alone > _FEWEST), jnp.asarray(ACCUMULATION, spread.dtype), ONGOING)
         # A reset that changes nothing is no event.
         part = (lambda mode: mode) if self.event_mode is None else self.event_mode
         happened = _differ((passage.before, part(state.mode)), (y, part(mode)))
@@ -453,15 +457,15 @@ class EventSolver(AbstractSolverWrapper):
             return self._guard_rates(t_event, state._replace(y=y, mode=mode), slope, new_args) > 0
 
         armed = self._policy.armed_after(clear, fired, memory.armed, rises)
-        if self.carries_on:
-            armed = jnp.where(dense, values > 0, armed)
+        if carries.any():
+            armed = jnp.where(vanishes & carried & carries, values > 0, armed)
         flags = _flags(fired, values)
         entry = EventLog(t_event, flags, each, (passage.before, state.mode), (y, mode))
         log = None if state.log is None else jtu.tree_map(lambda a, b: write(a, index, b), state.log, entry)
         passed = state._replace(y=passage.y, mode=mode), memory._replace(guard=_constant(values), armed=armed)
         after_reset = (
             passed[0]._replace(t=t_event, events=events, status=status, fired=flags, log=log),
-            passed[1]._replace(resets=memory.resets + 1, spread=spread),
+            passed[1]._replace(resets=memory.resets + 1, alone=alone, spread=spread),
         )
         event = t_event - early, slope
         if self.event_mode is None and (self.samples is None or self.samples.times is None):
