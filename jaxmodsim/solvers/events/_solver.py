@@ -443,7 +443,7 @@ class EventSolver(AbstractSolverWrapper):
         t_event, values, (y, mode, slope) = passage.t, passage.guards, passage.after
         spread, vanishes = _spread(t_event, state.t, memory)
         carried = jnp.any(fired & carries)
-        # Impacts that accumulate may have other events between them, but not several on end.
+        # Between impacts that accumulate there may be other events, but not many in a row.
         alone = jnp.where(carried, 0, memory.alone + 1)
         status = jnp.where(vanishes & (alone > _FEWEST), jnp.asarray(ACCUMULATION, spread.dtype), ONGOING)
         # A reset that changes nothing is no event.
