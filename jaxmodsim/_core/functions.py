@@ -105,6 +105,18 @@ class StateDependent(eqx.Module):
         )
 
 
+class Reaction(eqx.Module):
+    """A parameter that is the reaction of the constraint of this name; scenes solve for both together."""
+
+    constraint: str = eqx.field(static=True)
+
+    def __jax_array__(self) -> Array:
+        """Refuse the conversion to a number."""
+        raise TypeError(
+            f"This parameter is the reaction of the constraint {self.constraint!r}, so it has no value outside a scene."
+        )
+
+
 def as_state_function(value: object, *, name: str) -> Callable[..., PyTree]:
     """Convert a function of the mechanism's state, `fn(t, q, qd, params)`, to part of a law.
 
@@ -120,9 +132,8 @@ def as_state_function(value: object, *, name: str) -> Callable[..., PyTree]:
 
 def is_state_dependent(tree: object) -> bool:
     """Whether a parameter in `tree` depends on the state of the mechanism."""
-    return any(
-        isinstance(x, StateDependent) for x in jax.tree.leaves(tree, is_leaf=lambda x: isinstance(x, StateDependent))
-    )
+    of_state = (StateDependent, Reaction)
+    return any(isinstance(x, of_state) for x in jax.tree.leaves(tree, is_leaf=lambda x: isinstance(x, of_state)))
 
 
 def need_values(tree: eqx.Module, wanted: str) -> None:

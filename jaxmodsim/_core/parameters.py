@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .arrays import is_known
-from .functions import StateDependent, as_state_function, nominal
+from .functions import Reaction, StateDependent, as_state_function, nominal
 
 if TYPE_CHECKING:
     Number: TypeAlias = Any  # callers pass plain numbers; type checkers ignore the converter of `parameter`
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 else:
     Number: TypeAlias = Float[Array, ""]
     Vector: TypeAlias = Float[Array, " n"]
-    NumberOrState: TypeAlias = Float[Array, ""] | StateDependent
+    NumberOrState: TypeAlias = Float[Array, ""] | StateDependent | Reaction
 _Numbers: TypeAlias = Float[Array | np.ndarray, "..."]
 
 
@@ -242,14 +242,19 @@ def optional_vector_parameter(name: str, unit: str, *, lower: float | str | None
     return eqx.field(default=None, converter=convert, metadata={"range": Range(unit, lower)})
 
 
-def state_parameter(name: str) -> Any:
-    """Field for a function of the mechanism's state, of either sign, or a constant number."""
-    return eqx.field(converter=partial(_of_state, name=name))
+def state_parameter(name: str, *, reaction: bool = False) -> Any:
+    """Field for a function of the mechanism's state, of either sign, or a constant number.
+
+    With `reaction` it may also be the name of a constraint.
+    """
+    return eqx.field(converter=partial(_of_state, name=name, reaction=reaction))
 
 
-def _of_state(value: Any, *, name: str) -> object:
-    if isinstance(value, StateDependent):
+def _of_state(value: Any, *, name: str, reaction: bool) -> object:
+    if isinstance(value, StateDependent | Reaction):
         return value
+    if reaction and isinstance(value, str):
+        return Reaction(value)
     if callable(value):
         return StateDependent(None, as_state_function(value, name=name))
     number = as_number(value, name=name)

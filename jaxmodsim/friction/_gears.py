@@ -42,15 +42,14 @@ class Geared(AbstractSetValuedLaw):
       and Fs are coefficients. It is evaluated at positive slip only.
     - `torque`: transmitted torque, `torque(t, q, qd, params)` -> one number [N m], positive if it drives the load
       towards positive slip, such as that of the spring in an elastic joint; or a number. Numbers to differentiate or
-      fit belong in `params`.
+      fit belong in `params`. Or the name of a `Constraint` that is a rigid gear, whose reaction is the torque;
+      friction and reaction are then solved together. The gear drives where the reaction opposes slip.
     - `back`: as `drive`, for back-driving; by default the same.
-
-    If the torque is the multiplier of a `Constraint` (rigid gear) and keeps its sign, use
-    `Friction(asymmetric(Coulomb(mu_drive), Fc=mu_back), normal_force=NAME)`.
 
     **Raises:**
 
-    - `ValueError` if a law is not set-valued, a coefficient is out of range, or `torque` is no function and no number.
+    - `ValueError` if a law is not set-valued, a coefficient is out of range, or `torque` is no function, number or
+      name.
 
     **Example:**
 
@@ -70,7 +69,7 @@ class Geared(AbstractSetValuedLaw):
 
     law: AbstractSetValuedLaw = eqx.field(converter=partial(need_set_valued, owner="Geared"))
     drive: AbstractSetValuedLaw = eqx.field(converter=_per_torque)
-    torque: NumberOrState = state_parameter("Geared torque")
+    torque: NumberOrState = state_parameter("Geared torque", reaction=True)
     back: AbstractSetValuedLaw | None = eqx.field(default=None, converter=_unless_none)
     sides: Float[Array, " 1"] | None = eqx.field(default_factory=lambda: None, init=False, repr=False)
     stiff: ClassVar[bool] = False
@@ -81,6 +80,10 @@ class Geared(AbstractSetValuedLaw):
     )
     mujoco_lacks: ClassVar[str] = ": the friction of its joints does not depend on the transmitted torque"
     kinks: ClassVar[tuple[Callable[[Any], Scalar], ...]] = (lambda law: law.torque,)
+
+    def at_torque(self, torque: Scalar) -> "Geared":
+        """The part that depends on the torque, at this torque [N m]."""
+        return Geared(Coulomb(jnp.zeros_like(torque)), self.drive, torque, self.back)
 
     def _per_torque(self, side: Scalar, of: Callable[[AbstractSetValuedLaw], Scalar]) -> Scalar:
         """`|tau|` times `of(drive)` or `of(back)`, for slip towards `side` (+1 or -1)."""

@@ -326,8 +326,13 @@ class Dynamics(NamedTuple):
             return none, none
         assert self.friction is not None
         assert self.friction_elements.loads is not None
-        at = np.array([self.scene.loaded.index(name) for name in self.scene.guides])
-        return self.friction.normal[at], self.friction_elements.loads.rounding[at]
+        at, loads = (
+            np.array([self.scene.loaded.index(name) for name in self.scene.guides]),
+            self.friction_elements.loads,
+        )
+        unit = _ROUNDING * float(jnp.finfo(self.t.dtype).eps)
+        cancelled = jax.lax.stop_gradient(jnp.abs(loads.normal_coupling) * jnp.abs(self.friction.force)[None, :])
+        return self.friction.normal[at], (loads.rounding + unit * jnp.sum(cancelled, axis=1))[at]
 
     @property
     def contact_forces(self) -> Float[Array, " n"]:
@@ -447,7 +452,7 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
             size = jnp.sum(jnp.abs(linearized.rows * free[None, :, 0]), axis=1) + jnp.abs(linearized.bias)
             size, scale = jax.lax.stop_gradient((size, jnp.diagonal(linearized.matrix)))
             size = unit * size / jnp.where(scale > 0, scale, 1.0)
-            loads = _loads(scene, t, y, [len(each) for each in directions], multipliers, yields, of_guides, size)
+            loads = _loads(scene, t, y, directions, linearized.rows, multipliers, yields, of_guides, size)
     modes = jnp.zeros(0, q.dtype) if mode is None else scene.split_modes(mode)[0]
     elements = assemble_friction(friction, along, minv_jt, rounding, loads, t, q, qd, params, qdd, modes)
     solved = solve_friction_forces(elements, modes)
@@ -469,7 +474,8 @@ def _loads(
     scene: Scene,
     t: Array,
     y: State,
-    widths: list[int],
+    directions: list[Float[Array, "_ dof"]],
+    constraints: Float[Array, "m dof"],
     multipliers: Float[Array, " m"],
     yields: Float[Array, "m n"],
     sides: dict[str, Scalar],
@@ -477,22 +483,31 @@ def _loads(
 ) -> Loads:
     """Normal forces of the constraints that load friction, and their change by the friction forces.
 
-    `widths`: the number of rows of each element. `yields`: change of the multipliers with unit forces along the rows.
-    `sides`: signs of the loads of guides. `rounding`: errors of the multipliers.
+    `directions`: the rows of each element. `constraints`: those of the constraints. `yields`: change of the multipliers
+    with unit forces along the rows. `sides`: signs of the loads of guides. `rounding`: errors of the multipliers.
     """
     names, friction = scene.loaded, (*scene.event_driven.values(), *scene.reaction_loaded.values())
-    loaded = [x.load_constraint for x, width in zip(friction, widths, strict=True) for _ in range(width)]
+    rows = [(x, row) for x, each in zip(friction, directions, strict=True) for row in each]
+    loaded = [x.load_constraint for x, _ in rows]
     where = by_constraint(scene, t, y, jnp.arange(multipliers.shape[0]))
     chosen = dict(zip(scene.constraint_names, scene.constraints, strict=True))
     at = jnp.concatenate([where[name] for name in names])
     size = jnp.stack([chosen[name].per_multiplier(t, y.q, scene.params) for name in names])
+    on = jnp.asarray([[float(name == each) for name in names] for each in loaded], y.q.dtype)
+    drives: list[Scalar | None] = [None for _ in rows]
+    for i, (element, row) in enumerate(rows):
+        if element.transmits:
+            k, square = names.index(loaded[i] or ""), jnp.sum(row * row)
+            torque = -jnp.sum(constraints[at[k]] * row) / (size[k] * jnp.where(square > 0, square, 1.0))
+            on, drives[i] = on.at[i, k].set(jnp.abs(torque)), jnp.where(torque < 0, -1.0, 1.0)
     return Loads(
-        jnp.asarray([[float(name == each) for name in names] for each in loaded], y.q.dtype),
+        on,
         size * multipliers[at],
         size[:, None] * yields[at],
         jnp.asarray([0.0 if isinstance(chosen[name], Contact) else -1.0 for name in names], y.q.dtype),
         jnp.stack([sides.get(name, jnp.zeros_like(t)) for name in names]),
         jax.lax.stop_gradient(jnp.abs(size)) * rounding[at],
+        tuple(drives),
     )
 
 

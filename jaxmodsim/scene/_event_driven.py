@@ -14,7 +14,7 @@ forces are coefficients times n, and everything is solved together.
 
 from collections.abc import Callable
 from itertools import accumulate, product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -68,12 +68,14 @@ def mode_numbers(modes: Float[Array, "*time modes"], widths: tuple[int, ...]) ->
 class Loads(NamedTuple):
     """Constraints that load friction elements; k of them.
 
-    - `on`: 1 where constraint k loads row i, shape `[n, k]`.
+    - `on`: 1 where constraint k loads row i, shape `[n, k]`; for a gear the torque on its motor per newton.
     - `normal`: normal forces without the elements [N], shape `[k]`; negative ones pull.
     - `normal_coupling`: C, by which unit forces of the rows reduce the normal forces, shape `[k, n]`.
     - `pulls`: -1 for constraints whose friction is as large when they pull, 0 for those that can only push.
     - `side`: sign of a normal force that counts in its place, so that friction is smooth where it changes; 0 for none.
     - `rounding`: rounding errors of the normal forces [N].
+    - `drives`: for each row of a gear the sign of its load that drives positive slip: the constraint then opposes slip
+      of the motor, on whose side the friction acts. None for other rows.
     """
 
     on: Float[Array, "n k"]
@@ -82,6 +84,20 @@ class Loads(NamedTuple):
     pulls: Float[Array, " k"]
     side: Float[Array, " k"]
     rounding: Float[Array, " k"]
+    drives: tuple[Scalar | None, ...] = ()
+
+
+class LawForces(NamedTuple):
+    """Forces that a law allows [N, or per newton of load].
+
+    - `positive_slip`, `negative_slip`: in slip in either direction; zero in the rows of planes.
+    - `upper`, `lower`: limits of stick against a load in either direction, >= 0.
+    """
+
+    positive_slip: Float[Array, " *n"]
+    negative_slip: Float[Array, " *n"]
+    upper: Float[Array, " *n"]
+    lower: Float[Array, " *n"]
 
 
 class PlanarSlip(NamedTuple):
@@ -102,11 +118,11 @@ class FrictionElements(eqx.Module):
     - `free_slip_acceleration`: slip accelerations without these elements [m/s^2].
     - `delassus`: A [1/kg].
     - `minv_jt`: rows `W D_i`, the accelerations that a unit force takes away.
-    - `positive_slip`, `negative_slip`: forces in slip in either direction, at `v` [N, or per newton of load]; zero in
-      the rows of planes.
-    - `upper`, `lower`: limits of stick against a load in either direction, >= 0 [N, or per newton of load].
+    - `laws`: forces of the laws at `v`.
     - `planar`: None without planes.
     - `loads`: None where no load is a reaction.
+    - `gears`: None where no load is the torque of a gear. Otherwise, with zeros in all other rows, the forces without
+      torque [N], and by how much those per newton differ where the load is negative.
     - `planes`: first row, and row after the last, of each element whose slip is a vector.
     """
 
@@ -114,12 +130,10 @@ class FrictionElements(eqx.Module):
     free_slip_acceleration: Float[Array, " n"]
     delassus: Float[Array, "n n"]
     minv_jt: Float[Array, "n dof"]
-    positive_slip: Float[Array, " n"]
-    negative_slip: Float[Array, " n"]
-    upper: Float[Array, " n"]
-    lower: Float[Array, " n"]
+    laws: LawForces
     planar: PlanarSlip | None = None
     loads: Loads | None = None
+    gears: tuple[LawForces, LawForces] | None = None
     planes: tuple[tuple[int, int], ...] = eqx.field(static=True, default=())
 
     def in_planes(self, rows: Array, of_plane: Callable[[slice], Array]) -> Array:
@@ -224,38 +238,56 @@ def assemble_friction(
     - `mode`: modes, from which planes take their reference velocities.
     """
     one, zero = jnp.ones_like(t), jnp.zeros_like(t)
-    rows: list[tuple[Array, ...]] = []
+    none, flat = LawForces(zero, zero, zero, zero), (zero, zero)
+    rows: list[tuple[Any, ...]] = []
     planes: list[tuple[int, int]] = []
+
+    def of_law(element: Friction, v: Scalar, load: Scalar | None) -> LawForces:
+        limits = [element.static_limit(sign * one, load) for sign in (1.0, -1.0)]
+        slips = [element.slip_force(v, sign * one, load) for sign in (1.0, -1.0)] if v.ndim == 0 else flat
+        return LawForces(*slips, *limits)
+
     for element in friction:
         v, rate = element.slip_and_rate(t, q, qd, qdd, params)
         load = element.load(t, q, qd, params)
-        upper, lower = (element.static_limit(sign * one, load) for sign in (1.0, -1.0))
+        if loads is not None and (drives := loads.drives[len(rows)]) is not None:
+            alone, forces, returned = (of_law(part, v, None) for part in element.gear_parts(drives * one))
+            rows.append((v, rate, forces, flat, (alone, jax.tree.map(jnp.subtract, returned, forces))))
+            continue
+        forces = of_law(element, v, load)
         if v.ndim == 0:
-            positive, negative = (element.slip_force(v, sign * one, load) for sign in (1.0, -1.0))
-            rows.append((v, rate, positive, negative, upper, lower, zero, zero))
+            rows.append((v, rate, forces, flat, (none, none)))
             continue
         start, stop = len(rows), len(rows) + v.shape[0]
         planes.append((start, stop))
         v, rate = element.stretch(v), element.stretch(rate)
         onset = element.slip_force(zero, one, load)
         force = element.slip_force_in_plane(v, mode[start:stop] if mode.shape[0] else v, load)
-        rows += [(v[i], rate[i], zero, zero, upper, lower, force[i], onset) for i in range(v.shape[0])]
-    rows += [(zero, zero, one, one, one, one, zero, zero)] * (along.shape[0] - len(rows))
+        rows += [(v[i], rate[i], forces, (force[i], onset), (none, none)) for i in range(v.shape[0])]
+    unit = LawForces(one, one, one, one)
+    rows += [(zero, zero, unit, flat, (none, none))] * (along.shape[0] - len(rows))
     delassus = jnp.sum(along[:, None, :] * minv_jt[None], axis=2)
-    columns = [*zip(*rows, strict=True)]
-    v, rate, *forces = (jnp.stack(column) for column in columns[:6])
+    v, rate, laws, planar, gears = zip(*rows, strict=True)
+    v, rate, laws = _stacked(v), _stacked(rate), _stacked(laws)
     if rounding is not None:
         # Where constraints leave a direction no mobility (a slider at its dead centre), no force holds it. Rounding may
         # leave a mobility of zero or less, which would look as if no force were needed.
         if rounding[1] is not None:
             # A stop holds its mass without friction: a force within the limits is rounding over rounding.
-            still = jnp.abs(rate) <= rounding[1] + rounding[0] * jnp.minimum(*forces[2:])
+            still = jnp.abs(rate) <= rounding[1] + rounding[0] * jnp.minimum(laws.upper, laws.lower)
             held = still & (jnp.diagonal(delassus) <= rounding[0])
             rate = jnp.where(held, 0.0, rate)
             delassus = jnp.where(held[:, None] | held[None, :], 0.0, delassus)
-        delassus = delassus + jnp.diag(rounding[0])
-    planar = PlanarSlip(*(jnp.stack(column) for column in columns[6:])) if planes else None
-    return FrictionElements(v, rate, delassus, minv_jt, *forces, planar=planar, loads=loads, planes=tuple(planes))
+        # Where there is mobility it is as it is: with more, stick would drift, and error control would resolve that.
+        here = np.eye(rounding[0].shape[0], dtype=bool)
+        delassus = jnp.where(here, jnp.maximum(delassus, rounding[0][:, None]), delassus)
+    planar = PlanarSlip(*_stacked(planar)) if planes else None
+    gears = _stacked(gears) if any(each.transmits for each in friction) else None
+    return FrictionElements(v, rate, delassus, minv_jt, laws, planar, loads, gears, tuple(planes))
+
+
+def _stacked(rows: tuple[Any, ...]) -> Any:
+    return jax.tree.map(lambda *each: jnp.stack(each), *rows)
 
 
 def solve_friction_forces(
@@ -268,7 +300,7 @@ def solve_friction_forces(
     extra = elements.v.shape[0] - mode.shape[0]
     mode = jnp.concatenate([mode, jnp.ones(extra, mode.dtype)]) if extra else mode
     sticks = elements.sticks(mode)
-    slip_force = jnp.where(mode > 0, elements.positive_slip, elements.negative_slip)
+    slip_force = _slip_force(elements.laws, mode)
     if (planar := elements.planar) is not None:
 
         def in_plane(part: slice) -> Array:
@@ -281,45 +313,61 @@ def solve_friction_forces(
         slipping = jnp.where(sticks, 0.0, slip_force)
         drive = elements.free_slip_acceleration - apply_matrix(elements.delassus, slipping)
         force = jnp.where(sticks, _multipliers(elements, drive, sticks), slip_force)
-        return FrictionForces(force, elements.upper, elements.lower, jnp.ones_like(elements.v[0]), force[:0])
+        return FrictionForces(force, *elements.laws[2:], jnp.ones_like(elements.v[0]), force[:0])
     # Forces are linear in the loads. Columns: the slip forces without loads, beside the accelerations without friction;
-    # then the slip forces by one newton of each load alone.
-    on, coupling = elements.loads.on, elements.loads.normal_coupling
-    loaded = jnp.sum(on, axis=1)
-    slip_forces = jnp.concatenate([jnp.where(loaded > 0, 0.0, slip_force)[:, None], on * slip_force[:, None]], axis=1)
+    # then the slip forces by one newton of each load alone, and those of gears once more by one newton of pull.
+    (on, normal, coupling, pulls, side, *_), gears = elements.loads, elements.gears
+    loaded, k = jnp.sum(on, axis=1), on.shape[1]
+    unloaded = jnp.zeros_like(slip_force) if gears is None else _slip_force(gears[0], mode)
+    columns = [jnp.where(loaded > 0, unloaded, slip_force)[:, None], on * slip_force[:, None]]
+    if gears is not None:
+        columns.append(on * (slip_force + _slip_force(gears[1], mode))[:, None])
+    slip_forces = jnp.concatenate(columns, axis=1)
     slipping = jnp.where(sticks[:, None], 0.0, slip_forces)
-    free = jnp.pad(elements.free_slip_acceleration[:, None], ((0, 0), (0, on.shape[1])))
+    free = jnp.pad(elements.free_slip_acceleration[:, None], ((0, 0), (0, slip_forces.shape[1] - 1)))
     drive = free - apply_matrix(elements.delassus, slipping)
     forces = jnp.where(sticks[:, None], _multipliers(elements, drive, sticks), slip_forces)
-    fixed, per_load = forces[:, 0], forces[:, 1:]
-    normal = elements.loads.normal - apply_matrix(coupling, fixed)
-    gain = apply_matrix(coupling, per_load)
-    load, signed, margin = _solve_loads(normal, gain, elements.loads.pulls, elements.loads.side)
+    fixed, push, pull = forces[:, 0], forces[:, 1 : k + 1], forces[:, -k:]
+    gain = apply_matrix(coupling, forces)
+    signed, pushes, margin = _solve_loads(normal - gain[:, 0], gain[:, 1 : k + 1], pulls[None] * gain[:, -k:], side)
+    load = jnp.where(pushes, 1.0, pulls) * signed
+    force = fixed + apply_matrix(push if gears is None else jnp.where(pushes[None], push, pull), load)
     factor = jnp.where(loaded > 0, apply_matrix(on, load), 1.0)
-    force = fixed + apply_matrix(per_load, load)
-    return FrictionForces(force, factor * elements.upper, factor * elements.lower, margin, signed)
+    limits = [factor * limit for limit in elements.laws[2:]]
+    if gears is not None:
+        pulled = apply_matrix(on, jnp.where(pushes, 0.0, load))
+        limits = [x + alone + pulled * more for x, alone, more in zip(limits, gears[0][2:], gears[1][2:], strict=True)]
+    return FrictionForces(force, *limits, margin, signed)
+
+
+def _slip_force(laws: LawForces, mode: Float[Array, " n"]) -> Float[Array, " n"]:
+    return jnp.where(mode > 0, laws.positive_slip, laws.negative_slip)
 
 
 def _solve_loads(
-    normal: Float[Array, " k"], gain: Float[Array, "k k"], pulls: Float[Array, " k"], side: Float[Array, " k"]
-) -> tuple[Float[Array, " k"], Float[Array, " k"], Scalar]:
-    """Loads, `n` and margin of `n + gain load(n) = normal`, where `load(n)` is `n` for n >= 0 and `pulls n` otherwise.
+    normal: Float[Array, " k"], push: Float[Array, "k k"], pull: Float[Array, "k k"], side: Float[Array, " k"]
+) -> tuple[Float[Array, " k"], Bool[Array, " k"], Scalar]:
+    """Solution n of `n + G n = normal`, with column k of G that of `push` for n_k >= 0, and that of `pull` otherwise.
 
     A `side` that is not zero takes the place of the sign of n.
 
-    The margin is the smallest determinant of `I + gain S` over all slopes S. The determinant is linear in each slope,
-    so if it is positive at the ends of their ranges it is so in between, and then the solution is unique (J. Rohn,
-    Systems of linear interval equations, Linear Algebra and its Applications 126:39, 1989).
+    The margin is the smallest determinant of `I + G` over all G with columns between those of `push` and `pull`. The
+    determinant is linear in each column, so if it is positive for the columns themselves it is so in between, and then
+    the solution is unique (J. Rohn, Systems of linear interval equations, Linear Algebra and its Applications 126:39,
+    1989).
+
+    **Returns:**
+
+    n, which of them push, and the margin.
     """
     k = normal.shape[0]
     if k == 1:
-        slope = jnp.where(jnp.where(side == 0, normal, side) >= 0, 1.0, pulls)
-        signed = normal / (1.0 + gain[0] * slope)
-        return slope * signed, signed, jnp.minimum(1.0 + gain[0, 0], 1.0 + gain[0, 0] * pulls[0])
+        pushes = jnp.where(side == 0, normal, side) >= 0
+        return normal / (1.0 + jnp.where(pushes, push[0], pull[0])), pushes, 1.0 + jnp.minimum(push, pull)[0, 0]
 
-    # Cramer's rule for all choices of slopes at once: entries are vectors of length 2^k.
+    # Cramer's rule for all choices of columns at once: entries are vectors of length 2^k.
     takes = np.array(list(product((False, True), repeat=k))).T
-    rows = _rows(gain, jnp.where(takes, pulls[:, None], 1.0))
+    rows = _rows(jnp.where(takes[None], pull[:, :, None], push[:, :, None]))
     determinant = _determinant(rows)
     right, violation = _constant(jnp.unstack(normal)), jnp.zeros(2**k, normal.dtype)
     rows, divisor = _constant(rows), _constant(determinant)
@@ -328,19 +376,17 @@ def _solve_loads(
         signed = _determinant(replaced) / jnp.where(divisor == 0, jnp.nan, divisor)
         opposed = jnp.where(side[j] == 0, signed, side[j] * jnp.inf)
         violation = violation + jnp.maximum(jnp.where(takes[j], opposed, -opposed), 0.0)
-    # The choice whose signs agree with its slopes; two agree where a load is zero, and either is right.
+    # The choice whose signs agree with its columns; two agree where a load is zero, and either is right.
     best = jnp.min(jnp.where(jnp.isnan(violation), jnp.inf, violation))
-    slope = jnp.where(jnp.any(takes & (violation <= best)[None, :], axis=1), pulls, 1.0)
-    signed = jnp.stack(factor_lu(_rows(gain, _constant(slope)), pivot=True)(list(jnp.unstack(normal))))
-    slope = jnp.where(side == 0, jnp.where(signed >= 0, 1.0, pulls), slope)
-    return slope * signed, signed, jnp.min(determinant)
+    pushes = ~jnp.any(takes & (violation <= best)[None, :], axis=1)
+    signed = jnp.stack(factor_lu(_rows(jnp.where(pushes[None], push, pull)), pivot=True)(list(jnp.unstack(normal))))
+    return signed, jnp.where(side == 0, signed >= 0, pushes), jnp.min(determinant)
 
 
-def _rows(gain: Float[Array, "k k"], slope: Float[Array, "k *m"]) -> list[list[Array]]:
-    """Entries of `I + gain S`, for one vector of slopes or several."""
+def _rows(gain: Float[Array, "k k *m"]) -> list[list[Array]]:
+    """Entries of `I + gain`, for one matrix or several."""
     k = gain.shape[0]
-    expand = (k, k, *(1,) * (slope.ndim - 1))
-    matrix = gain.reshape(expand) * slope[None] + jnp.eye(k, dtype=gain.dtype).reshape(expand)
+    matrix = gain + jnp.eye(k, dtype=gain.dtype).reshape(k, k, *(1,) * (gain.ndim - 2))
     return [list(jnp.unstack(row)) for row in jnp.unstack(matrix)]
 
 
@@ -367,7 +413,7 @@ def _multipliers(
     event at rest. The motion stays exact until the load reverses; the largest element then slips early by twice that
     limit, and a run may end in chatter. One element with the sum of the limits avoids this.
     """
-    weight = 0.5 * (elements.upper + elements.lower)
+    weight = 0.5 * (elements.laws.upper + elements.laws.lower)
     largest = jnp.max(weight)
     weight = jnp.maximum(weight / jnp.where(largest > 0, largest, 1.0), _LEAST_SHARE)
     return solve_semidefinite(elements.delassus, drive, jnp.sqrt(jnp.where(largest > 0, weight, 1.0)), sticks)

@@ -4,7 +4,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -30,6 +30,8 @@ from .forces._switch import Switch
 _MOST_LOADS = 4
 # An impact tries every set of contacts that may push: two to this power.
 _MOST_CONTACTS = 6
+
+_Modes = TypeVar("_Modes", Array, range)
 
 
 def _params(params: PyTree) -> PyTree:
@@ -183,8 +185,13 @@ class Scene(AbstractReadable, eqx.Module):
             if effect.load_constraint not in self.constraint_names:
                 known = ", ".join(repr(x) for x in self.constraint_names) or "none"
                 raise ValueError(
-                    f"Friction {name!r}: normal_force={effect.load_constraint!r} names no constraint of the scene;"
-                    f" there are: {known}."
+                    f"Friction {name!r}: {'torque' if effect.transmits else 'normal_force'}={effect.load_constraint!r}"
+                    f" names no constraint of the scene; there are: {known}."
+                )
+            if effect.transmits and effect.load_constraint in self._all_contacts:
+                raise ValueError(
+                    f"Friction {name!r}: torque={effect.load_constraint!r} names a Contact, which only pushes; a gear"
+                    " needs a Constraint."
                 )
             if effect.karnopp:
                 raise ValueError(
@@ -304,9 +311,9 @@ class Scene(AbstractReadable, eqx.Module):
         """Number of kinks, see `side_values`, whose signs follow the modes of `mode_names` in an array of modes."""
         return sum(each.num_kinks for each in self.event_driven.values()) + len(self.guides)
 
-    def split_modes(self, modes: Array) -> tuple[Array, Array, Array]:
-        """An array over the modes in three parts: of the friction elements, of the contacts, of switches and kinks."""
-        end = modes.shape[0] - len(self.switches) - self.num_kinks
+    def split_modes(self, modes: _Modes) -> tuple[_Modes, _Modes, _Modes]:
+        """A sequence over the modes in three parts: friction elements, contacts, switches and kinks."""
+        end = len(modes) - len(self.switches) - self.num_kinks
         start = end - len(self.contacts)
         return modes[:start], modes[start:end], modes[end:]
 

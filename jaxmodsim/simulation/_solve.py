@@ -153,9 +153,9 @@ def _solver(
 
 def _carried_on(request: RunRequest) -> tuple[bool, ...]:
     """Which guards may fire again and again without time between: impacts, and friction where chatter is held."""
-    scene, modes = request.scene, request.scene.num_modes(request.q0.shape[0])
-    contacts, sides = len(scene.contacts), len(scene.switches) + scene.num_kinks
-    return (request.choices.stick_on_chatter,) * (modes - contacts - sides) + (True,) * contacts + (False,) * sides
+    kinds = request.choices.stick_on_chatter, True, False
+    parts = request.scene.split_modes(range(request.scene.num_modes(request.q0.shape[0])))
+    return tuple(carries for carries, part in zip(kinds, parts, strict=True) for _ in part)
 
 
 def _step_from(t: Array, scene: Scene) -> Scene:

@@ -9,7 +9,6 @@ from bench.conformance.case import same_order
 CASES = {case.name: case for each in (rotational, translational, impacts, gradients) for case in each.CASES}
 # Published at a tolerance of 1e-6: 2e-5 of the values, and more where a stop or a temperature adds up.
 PUBLISHED = 1e-5
-REFUSED = "Rotational.LossyGearDemo3"
 QUICK = ("Translational.Brake", "Translational.ElastoGap", "Rotational.EddyCurrentBrake", "diff_sim_grads task1")
 # Published by time-stepping of first order, and with another rule at a stop, see the test of it.
 COARSE = {"Siconos ImpactingStick": 2e-3, "Translational.HeatLosses": 6e-3}
@@ -35,7 +34,7 @@ def test_values_and_events(name):
     check(name, derivatives=False)
 
 
-@pytest.mark.parametrize("name", [name for name in CASES if name != REFUSED])
+@pytest.mark.parametrize("name", [*CASES])
 def test_values_events_and_derivatives(name):
     check(name, derivatives=True)
 
@@ -92,11 +91,6 @@ def test_a_stick_by_time_stepping_gives_the_published_figures_of_siconos():
             after = slid
         q, v = q + 0.5 * h * (v + after), after
     np.testing.assert_allclose([*q, *v], CASES["Siconos ImpactingStick"].published, rtol=1e-9)
-
-
-def test_a_gear_without_a_torque_in_its_mesh_is_refused_with_the_reason():
-    with pytest.raises(RuntimeError, match="Friction under the reaction of 'mesh' has lost its unique solution"):
-        CASES[REFUSED].ours(derivatives=False)
 
 
 def test_the_optima_of_two_tasks():

@@ -99,6 +99,79 @@ def test_the_gear_drives_locks_and_is_driven_back() -> None:
     assert check.ok, str(check)
 
 
+@pytest.mark.parametrize("side", [1.0, -2.0])
+def test_a_rigid_gear_drives_and_is_driven_in_one_slip(side: float) -> None:
+    """Under the torques 3 and 12 - 8 t that in the mesh changes its sign: the speed is a polynomial on either side.
+
+    The scale and the sign of the constraint do not matter.
+    """
+    c, J1, J2, T1, w0, t1 = 0.3, 0.4, 2.0, 3.0, 6.0, 1.4
+
+    def push(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del q, qd, p
+        return jnp.stack([T1 + 0.0 * t, 12.0 - 8.0 * t])
+
+    def kinetic(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del t, q, p
+        return 0.5 * (J1 * qd[0] ** 2 + J2 * qd[1] ** 2)
+
+    def mesh(t: Any, q: Any, p: Any) -> Any:
+        del t
+        return side * (p * q[1] - q[0])
+
+    def speed(x: Any) -> Any:
+        drive, back, ratio = x
+        gear = jms.Friction(Geared(Coulomb(c), drive, "mesh", back), along=motor_angle, name="gear")
+        scene = jms.Scene(kinetic, ratio, (jms.AppliedForce(push), gear), (jms.Constraint(mesh, name="mesh"),))
+        run = jms.simulate(scene, [0.0, 0.0], jnp.stack([w0, w0 / ratio]), t1)
+        return run.qd[-1, 0], run.stats["num_events"]
+
+    def exact(x: Any) -> Any:
+        drive, back, ratio = x
+        k = J2 / (J1 * ratio**2)
+        turn = (12.0 - ratio * k * (T1 - c)) / 8.0  # where k (T1 - c) = (12 - 8 t)/ratio
+        ends = [0.0, turn, t1]
+        gained = 0.0
+        for start, end, slope in zip(ends[:-1], ends[1:], (1.0 - back, 1.0 + drive), strict=True):
+            mean = (k * (T1 - c) - (12.0 - 4.0 * (start + end)) / ratio) / (1.0 + k * slope)
+            gained += (end - start) * (T1 - c - slope * mean) / J1
+        return w0 + gained
+
+    x = jnp.array([0.5, 0.3, 1.6])
+    slopes, (found, events) = jax.jacfwd(lambda x: (speed(x)[0], speed(x)), has_aux=True)(x)
+    assert int(events) == 0
+    assert float(found) == pytest.approx(float(exact(x)), abs=1e-9)
+    np.testing.assert_allclose(slopes, jax.jacfwd(exact)(x), atol=1e-8)
+
+
+def test_a_torque_that_a_reversal_turns_for_a_part_of_a_step() -> None:
+    """Slip reverses at 0.45 s; the torque in the mesh is negative from then to 0.451 s, within a step."""
+    c, drive, back, T, reversal, turn, t1 = 0.5, 0.4, 0.3, 2.0, 0.45, 0.451, 2.0
+
+    def push(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del q, qd, p
+        return jnp.stack([T + 0.0 * t, T - c + turn - t])
+
+    def gained(start: float, end: float, side: float, slope: float) -> float:
+        """Change of speed, where the friction is `side c` and `slope` per torque."""
+        load = 0.5 * (start + end) - turn - T + c
+        return (end - start) * (T - side * c - (1.0 + slope) * load) / (2.0 + slope)
+
+    gear = jms.Friction(Geared(Coulomb(c), drive, "mesh", back), along=motor_angle, name="gear")
+    mesh = jms.Constraint(lambda t, q, p: q[0] - q[1], name="mesh")
+
+    def kinetic(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del t, q, p
+        return 0.5 * jnp.sum(qd**2)
+
+    masses = jms.Scene(kinetic, effects=(jms.AppliedForce(push), gear), constraints=(mesh,))
+    before = gained(0.0, reversal, -1.0, -back)
+    run = jms.simulate(masses, [0.0, 0.0], [-before, -before], t1)
+    np.testing.assert_allclose(run.events.t, [reversal], rtol=1e-9)
+    after = gained(reversal, turn, 1.0, -back) + gained(turn, t1, 1.0, drive)
+    np.testing.assert_allclose(run.qd[-1], after, rtol=1e-9)
+
+
 def test_a_bristle_has_the_levels_of_its_law_in_steady_slip() -> None:
     tau, v = jnp.array(-0.9), jnp.array(0.37)
     inside = Geared(asymmetric(Stribeck(0.1, 0.2, 0.3, 0.05), Fc=0.15), Stribeck(0.2, 0.3, 0.4), tau, 0.35)
@@ -174,7 +247,7 @@ def test_it_stands_beside_lugre_and_an_elastic_joint() -> None:
         (lambda: Geared(cast(Any, jms.Viscous(0.1)), 0.1, spring), "Geared needs a set-valued law"),
         (lambda: Geared(Coulomb(0.1), -0.1, spring), "Fc must be finite and >= 0"),
         (lambda: Geared(Coulomb(0.1), "a", spring), "Geared drive and back must be a real number"),
-        (lambda: Geared(Coulomb(0.1), 0.1, "a"), "Geared torque must be a real number"),
+        (lambda: Geared(Coulomb(0.1), 0.1, [1.0]), "Geared torque must be a real number"),
         (lambda: Bristle(cast(Any, jms.Viscous(0.1)), 1e-3), "Bristle needs a set-valued law"),
         (lambda: Bristle(Coulomb(0.1), 0.0), "h must be finite and > 0"),
         (

@@ -340,14 +340,33 @@ def test_a_load_of_a_reaction_sticks_and_slides_exactly() -> None:
     np.testing.assert_allclose(run.qd[1, 0], 0.25 * since**2 + (1.6 - 1.2) * since, rtol=1e-8)
 
 
-def all_loads(normal: Any, gain: Any, pulls: Any) -> list[Any]:
-    """Every solution of n + gain load(n) = normal, by trying all signs."""
+def test_stick_within_a_constraint_takes_few_steps_in_single_precision() -> None:
+    """Two shafts with a gear, held against 4 sin(5 t): stick that drifts would be resolved in steps of 1e-5 s."""
+
+    def push(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del q, qd, p
+        return jnp.stack([4.0 * jnp.sin(5.0 * t), 0.0 * t])
+
+    def mesh(t: Any, q: Any, p: Any) -> Any:
+        del t, p
+        return q[1] - q[0] / 1.7
+
+    real = jnp.float32
+    friction = Friction(Coulomb(real(10.0)), along=lambda q: q[0])
+    scene = Scene(free, effects=(AppliedForce(push), friction), constraints=(Constraint(mesh),))
+    run = simulate(scene, jnp.zeros(2, real), jnp.zeros(2, real), real(2.0))
+    assert run.q.dtype == real
+    assert float(jnp.max(jnp.abs(run.q))) < 1e-9
+    assert int(run.stats["num_steps"]) < 1000
+
+
+def all_loads(normal: Any, push: Any, pull: Any) -> list[Any]:
+    """Every solution of n + G n = normal with columns of `push` for n > 0, and of `pull`, by trying all signs."""
     found = []
-    for signs in itertools.product((1.0, 0.0), repeat=len(normal)):
-        slope = np.where(np.array(signs) > 0, 1.0, pulls)
-        n = np.linalg.solve(np.eye(len(normal)) + gain * slope[None, :], normal)
-        if np.all((n > 0) == (np.array(signs) > 0)):
-            found.append(slope * n)
+    for signs in itertools.product((True, False), repeat=len(normal)):
+        n = np.linalg.solve(np.eye(len(normal)) + np.where(signs, push, pull), normal)
+        if np.all((n > 0) == np.array(signs)):
+            found.append(n)
     return found
 
 
@@ -359,18 +378,20 @@ def test_loads_that_depend_on_each_other(k: int) -> None:
     counts = {True: 0, False: 0}
     for _ in range(200):
         gain, normal = rng.normal(scale=0.6, size=(k, k)), rng.normal(size=k)
-        pulls = rng.choice([0.0, -1.0], size=k)
-        load, n, margin = solve(jnp.asarray(normal), jnp.asarray(gain), jnp.asarray(pulls), jnp.zeros(k))
-        solutions = all_loads(normal, gain, pulls)
+        columns = jnp.asarray(gain), jnp.asarray(gain * rng.choice([0.0, -1.0, -0.5], size=k))
+        n, pushes, margin = solve(jnp.asarray(normal), *columns, jnp.zeros(k))
+        solutions = all_loads(normal, *columns)
         counts[bool(margin > 0)] += 1
         if margin > 0:
             assert len(solutions) == 1
-            np.testing.assert_allclose(load, solutions[0], atol=1e-10)
+            np.testing.assert_allclose(n, solutions[0], atol=1e-10)
+            np.testing.assert_array_equal(pushes, n > 0)
             given = jnp.sign(n) * rng.choice([0.0, 1.0], size=k)
-            np.testing.assert_allclose(solve(normal, gain, pulls, given)[0], load, atol=1e-10)
+            np.testing.assert_allclose(solve(normal, *columns, given)[0], n, atol=1e-10)
             one = rng.integers(k)  # beyond its zero a load goes on
-            beyond = solve(normal, gain, pulls, jnp.zeros(k).at[one].set(-jnp.sign(n[one])))
-            np.testing.assert_allclose(beyond[0][one], (pulls[one] if n[one] > 0 else 1.0) * beyond[1][one], atol=1e-10)
+            beyond, sides, _ = solve(normal, *columns, jnp.zeros(k).at[one].set(-jnp.sign(n[one])))
+            assert bool(sides[one]) != bool(pushes[one])
+            np.testing.assert_allclose(beyond + np.where(sides, *columns) @ beyond, normal, atol=1e-10)
     assert min(counts.values()) > 10
 
 

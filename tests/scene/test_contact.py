@@ -21,7 +21,7 @@ from jaxmodsim import (
     Stribeck,
     simulate,
 )
-from jaxmodsim.scene._event_driven import FrictionElements, next_modes, solve_friction_forces
+from jaxmodsim.scene._event_driven import FrictionElements, LawForces, next_modes, solve_friction_forces
 from jaxmodsim.simulation._solve import compiled_runs
 
 from ..hard.many_events import Contradictory
@@ -50,7 +50,8 @@ def random_contact(rng: np.random.Generator, n: int, stiction: bool) -> Friction
     level = limit * rng.uniform(0.5, 1.0, n) if stiction else limit
     base = 3.0 * rng.normal(size=n) * np.diag(coupling)
     numbers = (np.zeros(n), base, coupling, directions, level, -level, limit, limit)
-    return FrictionElements(*(jnp.asarray(x) for x in numbers), planar=None, loads=None, planes=())
+    numbers = [jnp.asarray(x) for x in numbers]
+    return FrictionElements(*numbers[:4], LawForces(*numbers[4:]))
 
 
 @jax.jit
@@ -68,7 +69,7 @@ def consistent(found: FrictionElements, modes: np.ndarray) -> np.ndarray:
     """Of sets of modes: stick within limits and without acceleration, slip not accelerated against its direction."""
     force = np.asarray(forces(found, modes))
     acceleration = np.asarray(found.free_slip_acceleration) - force @ np.asarray(found.delassus).T
-    held = (np.abs(force) <= np.asarray(found.upper) * (1 + 1e-9)) & (np.abs(acceleration) < 1e-7)
+    held = (np.abs(force) <= np.asarray(found.laws.upper) * (1 + 1e-9)) & (np.abs(acceleration) < 1e-7)
     return np.all(np.where(modes == 0, held, modes * acceleration > -1e-9), axis=1)
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from jaxmodsim.scene._event_driven import (
     FrictionElements,
+    LawForces,
     Loads,
     PlanarSlip,
     friction_guards,
@@ -34,10 +35,9 @@ def scalars(**numbers: Any) -> FrictionElements:
         "upper": [1.0, 1.0],
         "lower": [1.0, 1.0],
     }
-    loads = numbers.pop("loads", None)
-    return FrictionElements(
-        **{name: jnp.asarray(x, float) for name, x in (usual | numbers).items()}, planar=None, loads=loads, planes=()
-    )
+    loads, gears = numbers.pop("loads", None), numbers.pop("gears", None)
+    values = [jnp.asarray(x, float) for x in (usual | numbers).values()]
+    return FrictionElements(*values[:4], LawForces(*values[4:]), loads=loads, gears=gears)
 
 
 def plane(v: Any, free: Any = (0.0, 0.0, 0.0)) -> FrictionElements:
@@ -45,10 +45,8 @@ def plane(v: Any, free: Any = (0.0, 0.0, 0.0)) -> FrictionElements:
     limit = jnp.array([2.0, 2.0, 1.0])
     force, onset = jnp.array([0.3, 0.4, 0.0]), jnp.array([1.5, 1.5, 0.0])
     unused = jnp.array([jnp.nan, jnp.nan, 1.0])
-    return FrictionElements(
-        jnp.asarray(v, float), jnp.asarray(free, float), jnp.eye(3), jnp.eye(3), unused, -unused, limit, limit,
-        PlanarSlip(force, onset), planes=((0, 2),),
-    )  # fmt: skip
+    laws, motion = LawForces(unused, -unused, limit, limit), (jnp.asarray(v, float), jnp.asarray(free, float))
+    return FrictionElements(*motion, jnp.eye(3), jnp.eye(3), laws, PlanarSlip(force, onset), planes=((0, 2),))
 
 
 def test_stick_takes_the_acceleration_that_slip_leaves() -> None:
@@ -69,6 +67,28 @@ def test_a_reaction_as_load_is_solved_with_the_friction_under_it(pulls: float, n
     np.testing.assert_allclose(forces.force, [0.5 * load, (1.0 - 0.5 * load) / 2.0], rtol=1e-13)
     np.testing.assert_allclose(forces.upper, [load, 1.0], rtol=1e-13)
     np.testing.assert_allclose(forces.margin, 1.0 + 0.2 * min(1.0, pulls), rtol=1e-14)
+
+
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+@pytest.mark.parametrize("normal", [10.0, -10.0])
+def test_a_gear_has_coefficients_by_the_direction_of_power(normal: float, direction: float) -> None:
+    """n = normal - 0.4 f with f = direction (0.3 + c |n|): c is 0.5 where direction n > 0, and 0.2 otherwise."""
+    law, other = ([0.5, -0.2, 0.5, 0.2], [0.2, -0.5, 0.2, 0.5])
+    first = jnp.array([1.0, 0.0])
+    returned = LawForces(*(first * (b - a) for a, b in zip(law, other, strict=True)))
+    gears = LawForces(*(first * x for x in (0.3, -0.3, 0.4, 0.4))), returned
+    on, coupling, none = jnp.array([[1.0], [0.0]]), jnp.array([[0.4, 0.0]]), jnp.zeros(1)
+    loads = Loads(on, jnp.array([normal]), coupling, jnp.array([-1.0]), side=none, rounding=none)
+    sides = {"positive_slip": 0.5, "negative_slip": -0.2, "upper": 0.5, "lower": 0.2}
+    of_rows = {name: [x, np.sign(x)] for name, x in sides.items()}
+    forces = solve_friction_forces(scalars(loads=loads, gears=gears, **of_rows), jnp.array([direction, 0.0]))
+    c = 0.5 if direction * normal > 0 else 0.2
+    n = (normal - 0.12 * direction) / (1.0 + 0.4 * c * direction * np.sign(normal))
+    np.testing.assert_allclose(forces.normal, [n], rtol=1e-14)
+    np.testing.assert_allclose(forces.force[0], direction * (0.3 + c * abs(n)), rtol=1e-14)
+    forwards, backwards = (0.5, 0.2) if normal > 0 else (0.2, 0.5)
+    np.testing.assert_allclose(forces.upper, [0.4 + forwards * abs(n), 1.0], rtol=1e-14)
+    np.testing.assert_allclose(forces.lower, [0.4 + backwards * abs(n), 1.0], rtol=1e-14)
 
 
 def test_slip_in_a_plane_has_forces_of_its_own() -> None:

@@ -23,6 +23,7 @@ FALLS: dict[str, tuple[Any, bool, float | None]] = {
     "dips between two samples": (lambda s: (s - 0.42) ** 2 - 1e-3, True, 0.42 - 1e-3**0.5),
     "violated, not armed": (lambda s: -0.1 - s, False, None),
     "violated, armed": (lambda s: -0.1 - s, True, 0.0),
+    "violated, armed, and positive at every other sample": (lambda s: s - 0.1, True, 0.0),
     "zero and rising, not armed": (lambda s: s * (0.8 - s), False, 0.8),
     "zero and rising, back before a sample": (lambda s: s * (0.2 - s), False, 0.2),
 }

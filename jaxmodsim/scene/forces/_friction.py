@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PyTree
 
 from ..._core.arguments import as_label
 from ..._core.arrays import PerDof, Scalar, is_known
-from ..._core.functions import StateDependent, as_function, depends_on, is_state_dependent, result_shape
+from ..._core.functions import Reaction, StateDependent, as_function, depends_on, is_state_dependent, result_shape
 from ..._core.parameters import AbstractRanged, Default, Number, Range, as_number, modules_of, optional_parameter
 from ..._core.position import PositionFn, as_optional_position_fn
 from ..._core.safe import safe_norm
@@ -53,17 +53,11 @@ def _belt(value: Any) -> Any:
     return as_number(value, name="Friction belt_velocity")
 
 
-class ReactionLoad(eqx.Module):
-    """The load is the force of the constraint of this name."""
-
-    constraint: str = eqx.field(static=True)
-
-
 def _load(value: Any) -> Any:
-    if value is None or isinstance(value, ReactionLoad):
+    if value is None or isinstance(value, Reaction):
         return value
     if isinstance(value, str):
-        return ReactionLoad(value)
+        return Reaction(value)
     if callable(value):
         return as_function(value, name="Friction normal_force")
     return as_number(value, name="Friction normal_force")
@@ -132,7 +126,7 @@ class Friction(AbstractEffect, AbstractRanged):
     belt_velocity: Number | Callable[..., Any] = eqx.field(
         default=Default(0.0), converter=_belt, metadata={"range": Range("")}
     )
-    normal_force: Number | Callable[..., Any] | ReactionLoad | None = eqx.field(
+    normal_force: Number | Callable[..., Any] | Reaction | None = eqx.field(
         default=None, converter=_load, metadata={"range": Range("N", 0.0)}
     )
     name: str | None = eqx.field(default=None, static=True, converter=partial(as_label, name="Friction name"))
@@ -161,8 +155,22 @@ class Friction(AbstractEffect, AbstractRanged):
 
     @property
     def load_constraint(self) -> str | None:
-        """Name of the constraint whose reaction is the load; None for other loads."""
-        return self.normal_force.constraint if isinstance(self.normal_force, ReactionLoad) else None
+        """Name of the constraint whose reaction is the load, or the torque of a gear; None for others."""
+        reaction = self.law.torque if self.transmits else self.normal_force
+        return reaction.constraint if isinstance(reaction, Reaction) else None
+
+    @property
+    def transmits(self) -> bool:
+        """Whether the law is that of a gear whose torque is the reaction of a constraint."""
+        return isinstance(self.law, Geared) and isinstance(self.law.torque, Reaction)
+
+    def gear_parts(self, torque: Scalar) -> tuple["Friction", "Friction", "Friction"]:
+        """Elements with parts of the law of a gear: without torque, and the rest at `torque` and at `-torque`."""
+        law = self.law
+        assert isinstance(law, Geared)
+        parts = law.law, law.at_torque(torque), law.at_torque(-torque)
+        alone, drives, returns = (eqx.tree_at(lambda x: x.law, self, part) for part in parts)
+        return alone, drives, returns
 
     def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
         """Check the shapes of displacement, belt velocity and load."""
@@ -191,6 +199,16 @@ class Friction(AbstractEffect, AbstractRanged):
             raise ValueError(
                 f"Friction {name!r}: ellipse needs slip that is a vector of two components, but slip has the shape"
                 f" {slip}: return a position of shape (2,) from along."
+            )
+        if sum(isinstance(module, Reaction) for _, module in modules_of(self.law)) > self.transmits:
+            raise ValueError(
+                f"Friction {name!r}: the torque of Geared is the reaction of a constraint, so the law must be Geared"
+                f" itself, run by events, and not part of {type(self.law).__name__}."
+            )
+        if self.transmits and self.normal_force is not None:
+            raise ValueError(
+                f"Friction {name!r}: the torque of its gear is the reaction of {self.load_constraint!r}; leave out"
+                " normal_force."
             )
         self._check_direction(q, params, name)
         load = None if self.load_constraint is not None else self.normal_force
@@ -298,7 +316,7 @@ class Friction(AbstractEffect, AbstractRanged):
     def load(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Scalar | None:
         """Normal load [N], never negative; None if the law's forces are in newtons, or per newton of a reaction."""
         fn = self.normal_force
-        if fn is None or isinstance(fn, ReactionLoad):
+        if fn is None or isinstance(fn, Reaction):
             return None
         load = jnp.asarray(fn(t, q, qd, params) if callable(fn) else fn)
         return jnp.where(load < 0, 0.0, load)  # the derivative of `maximum` at zero is a half
@@ -321,8 +339,9 @@ class Friction(AbstractEffect, AbstractRanged):
 
     @property
     def _kinked(self) -> list[Any]:
-        """The laws with kinks, within others, too."""
-        return [x for _, x in modules_of(self.law) if isinstance(x, AbstractSetValuedLaw) and x.kinks]
+        """The laws with kinks, within others, too. A kink at a reaction of zero is that of `Scene.guides`."""
+        laws = [x for _, x in modules_of(self.law) if isinstance(x, AbstractSetValuedLaw) and x.kinks]
+        return [x for x in laws if not (self.transmits and x is self.law)]
 
     def apply_force(self, q: PerDof, force: Float[Array, "..."], params: PyTree) -> PerDof:
         """Generalised force of the friction force `force`."""
