@@ -99,10 +99,11 @@ class FilterRun(eqx.Module):
 class FrictionFilter(eqx.Module):
     """Kalman filter of a scene, with the states of its friction laws and some of its numbers among the states.
 
-    A prediction is one step of `ImplicitFriction` from one time to the next. Numbers, such as a level of friction or a
-    load, vary slowly: they are random walks. Those that are positive, by their range or as a `normal_force`, are
-    estimated as logarithms. A friction element with `normal_force=1.0` has its level as the number
-    `friction.normal_force`, which scales the force of any law.
+    A prediction is one step of `ImplicitFriction` from one time to the next, at the coordinates in the middle, and
+    with coordinates that follow the mean velocity. Numbers, such as a level of friction or a load, vary slowly: they
+    are random walks. Those that are positive, by their range or as a `normal_force`, are estimated as logarithms. A
+    friction element with `normal_force=1.0` has its level as the number `friction.normal_force`, which scales the force
+    of any law.
 
     In stick a measurement of the motion contains no information on the level of friction, but a bristle, or the creep
     of a smooth law, seems to contain some. While the estimated slip speed of an element is below `rest`, its numbers
@@ -355,8 +356,10 @@ class FrictionFilter(eqx.Module):
 
     def _advance(self, x: Array, t0: Scalar, t1: Scalar, inputs: Mapping[str, Array]) -> Array:
         y, scene = self._split(x, inputs)
-        after, solved = scene_step(scene, t0, t1, y)
-        flat = ravel_pytree(after)[0]
+        # Coordinates follow the mean velocity: with that at t1, a velocity known by positions would lag by half a step.
+        half = 0.5 * (t1 - t0)
+        after, solved = scene_step(scene, t0, t1, State(y.q + half * y.qd, y.qd, y.z))
+        flat = ravel_pytree(State(after.q - half * after.qd, after.qd, after.z))[0]
         return jnp.concatenate([jnp.where(solved, flat, jnp.nan), x[flat.size :]])
 
     def _free(self, x: Gaussian, t: Scalar, inputs: Mapping[str, Array]) -> Float[Array, " n"]:

@@ -231,3 +231,16 @@ def test_innovations_of_a_measured_axis_are_not_white() -> None:
     assert 1.96 / np.sqrt(white.size) < abs(correlation[0]) < 0.15
     assert correlation[1] > 0.3
     np.testing.assert_allclose(np.mean(run.band(LEVEL)[0][1000:]), 1.0, atol=0.05)
+
+
+@pytest.mark.parametrize("transform", [linearized, unscented])
+def test_the_velocity_of_an_accelerated_slip_has_no_lag(transform):
+    """Under a constant force, in closed form; a lag of half a step is four standard deviations here."""
+    dry, drift = axis(jms.Regularized(jms.Coulomb(2.0), width=1e-3)), {"qd[0]": 0.02, LEVEL: 0.05}
+    filter = FrictionFilter(dry, 1e-5, drift, numbers=(LEVEL,), transform=transform)
+    t, rate = jnp.arange(0.0, 1.0, 5e-3), 5.0
+    start = filter.start([0.0], [0.1], {"q[0]": 1e-4, "qd[0]": 1e-2, LEVEL: 0.2})
+    run = filter.run(t, (0.1 * t + 0.5 * rate * t**2)[:, None], {"u": jnp.full(t.size, 2.0 + rate)}, start)
+    error = (run.states.mean[20:, 1] - 0.1 - rate * t[20:]) / run.states.std[20:, 1]
+    assert jnp.max(jnp.abs(error)) < 0.2
+    np.testing.assert_allclose(run.band(LEVEL)[0][20:], 1.0, atol=0.01)
