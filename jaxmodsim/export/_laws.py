@@ -78,7 +78,7 @@ def to_modelica(
         return f"Modelica.Mechanics.Rotational.Components.LossyGear {name}(ratio=1, lossTable=[{table}]);"
     forward, limit = _both_ways(law, speeds)
     level = forward[0]
-    peak = limit / level if level > 0 else 1.0
+    peak = max(limit / level, 1.0) if level > 0 else 1.0
     rows = _written(_table(speeds, forward[:, None], rtol))
     kind, table = ("Rotational", "tau_pos") if rotary else ("Translational", "f_pos")
     component = "BearingFriction" if rotary else "SupportFriction"
@@ -100,7 +100,9 @@ def _both_ways(law: AbstractLaw, speeds: Float[np.ndarray, " n"]) -> tuple[Float
             " the law of one direction, or the mean of both."
         )
     level, limit = forward[0], float(limits[0])
-    if not np.isfinite(forward).all() or limit < level or (level == 0 and limit > 0):
+    # Stribeck's level is Fc + (Fs - Fc), which rounding can put above Fs.
+    below = limit < level and not np.isclose(limit, level, rtol=1e-6, atol=0.0)
+    if not np.isfinite(forward).all() or below or (level == 0 and limit > 0):
         raise ValueError(
             "to_modelica: the static limit must be at least the sliding force at v = 0, which must be > 0 if the limit"
             f" is, and all forces finite, but the limit is {limit:g} N and the sliding force {level:g} N."

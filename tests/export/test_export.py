@@ -158,6 +158,8 @@ def test_modelica_declarations() -> None:
     assert to_modelica(jms.Coulomb(1.5, 2.25), 1.0) == (
         "Modelica.Mechanics.Translational.Components.SupportFriction friction(f_pos=[0, 1.5; 1, 1.5], peak=1.5);"
     )
+    rounded = jms.Stribeck(Fc=6.105694180095081, Fs=15.013859993693833, vs=0.1)  # Fc + (Fs - Fc) > Fs
+    assert to_modelica(rounded, 1.0, rtol=0.05).endswith("peak=1);")
     rotary = to_modelica(STRIBECK, 1.0, name="bearing", rotary=True)
     assert rotary.startswith("Modelica.Mechanics.Rotational.Components.BearingFriction bearing(tau_pos=[0, 1.75; ")
 
