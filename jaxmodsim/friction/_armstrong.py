@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from .._core.arrays import Scalar
 from .._core.functions import nominal
 from .._core.parameters import Number, parameter
+from .._core.safe import decay_mean
 from ._bristles import advance_elastoplastic, slip_fraction
 from ._law import MOST_STICTION, AbstractDynamicLaw, LawCase, Passivity, register_law, stribeck_case
 
@@ -156,14 +157,15 @@ class Armstrong(AbstractDynamicLaw):
         corner, distance = jnp.asarray(_CORNER, z.z.dtype), jnp.abs(v) * dt
         # Slip until the deflection is zero after a reversal, then slip that the contact does not follow.
         back = jnp.minimum(distance, jnp.where(v * z.z < 0, jnp.abs(z.z), 0.0))
-        lost = jnp.maximum(
-            distance - jnp.abs(advance_elastoplastic(v, z.z, dt, self._limit(z.rise), corner) - z.z), 0.0
-        )
+        follows = jnp.sign(v) * (advance_elastoplastic(v, z.z, dt, self._limit(z.rise), corner) - z.z)
+        lost = jnp.maximum(distance - follows, 0.0)
         turn = self._turn()
         before = z.slip / turn * jnp.exp(-back / turn)
         slips = 1.0 - (1.0 - before) * jnp.exp(-lost / turn)
-        share = jnp.maximum(before, lost / jnp.where(distance > 0, distance, 1.0))
-        sliding = jnp.minimum(share, 1.0) * self._moves(v) * dt
+        # Mean weight of slip: as before while the contact follows, then that of the slip which it does not follow.
+        share = jnp.minimum(lost / jnp.where(distance > 0, distance, 1.0), 1.0)
+        mean = before + share * (1.0 - before) * (1.0 - decay_mean(lost / turn))
+        sliding = mean * self._moves(v) * dt
         resting = dt - sliding
         missing = (1.0 - z.rise) / (1.0 + (1.0 - z.rise) * resting / self.gamma)
         magnitude = 1.0 - missing + (z.magnitude - 1.0 + missing) * jnp.exp(-resting / self.tau)

@@ -32,8 +32,8 @@ class MaxwellSlip(AbstractDynamicLaw):
     A sudden transition from stick to slip would make the rates jump, and chatter if the limit depends on velocity. So
     an element follows the surface up to `1 - corner` of its limit and yields gradually above:
     `z' = v (1 - max(0, u - 1 + corner)/corner)` with `u = k z sign(v)/s_i(v)`. With `C` an element beyond its limit
-    (after an increase of speed) returns as in the generalised model, `F_i' = sign(v) C (alpha_i - F_i/s(v))`, a lag in
-    time. Here s is the sum of all s_i, and `alpha_i = Fc_i/sum Fc`.
+    (after an increase of speed) returns by `F_i' = sign(v) C alpha_i (1 - |F_i|/s_i(v))`, a lag in time, where
+    `alpha_i = Fc_i/sum Fc`. This is the generalised model if all elements have the same Fs/Fc.
 
     **Arguments:**
 

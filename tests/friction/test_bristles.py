@@ -111,6 +111,21 @@ def test_armstrong_stiction_comes_back_as_published() -> None:
         np.testing.assert_allclose(law.force(jnp.array(1e-5), slow), 1.25, rtol=1e-3)
 
 
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_short_exact_step_of_armstrong_has_the_rates_of_its_equations(side: float) -> None:
+    """Below and beyond the limit, which falls while the contact begins to slip, and after a reversal."""
+    law = jms.Armstrong(sigma0=1e4, Fc=1.0, Fs=1.5, vs=0.05, Fv=0.1, tau=0.01, gamma=1.0)
+    values = ([-0.5, 0.3, 0.995, 1.1], [0.0, 0.5], [1e-4, 0.02])
+    u, share, speed = (x.ravel() for x in jnp.meshgrid(*map(jnp.array, values)))
+    rise = jnp.full_like(u, 0.4)
+    z = ArmstrongState(side * u * 1.2e-4, rise, 0.7 * jnp.ones_like(u), share * 2e-6)
+    dt = 1e-11 / speed
+    after = jax.vmap(law.step_exact)(side * speed, z, dt)
+    scales = (speed, 100.0, 100.0, speed)
+    for rate, x0, x1, scale in zip(jax.vmap(law.zdot)(side * speed, z), z, after, scales, strict=True):
+        np.testing.assert_allclose((x1 - x0) / dt / scale, rate / scale, atol=1e-3)
+
+
 def test_armstrong_friction_lags_by_its_time_constant() -> None:
     """A step of the velocity in slip: the Stribeck friction follows with exp(-t/tau)."""
     law = jms.Armstrong(sigma0=1e6, Fc=1.0, Fs=1.5, vs=1e-2, Fv=0.0, tau=0.02, gamma=1.0)
