@@ -120,7 +120,7 @@ fmi3Status fmi3EnterInitializationMode(fmi3Instance instance, fmi3Boolean tolera
   (void)stopDefined, (void)stop;
   if (s->phase != INSTANTIATED) return fail(c, "the initialization mode follows instantiation or reset");
   if (toleranceDefined && tolerance > 0.0) s->atol *= tolerance / s->rtol, s->rtol = tolerance;
-  s->t = s->begin = s->last = start;
+  s->t = s->begin = s->last = s->ended = s->before = start;
   s->phase = INITIALIZATION;
   motion_tolerances(&c->motion);
   return fmi3OK;
@@ -142,7 +142,9 @@ fmi3Status fmi3EnterEventMode(fmi3Instance instance) {
   if (!c->steps) s->moved = motion_project(&c->motion, s->y) > 0.0;
   if (!c->steps && motion_due(&c->motion, 64.0 * 2.3e-16 * fabs(s->t))) {
     /* Importers stop behind the root; the event is at the root, but not before the last one. */
-    s->back = motion_to_root(&c->motion);
+    const double step = s->ended < s->t ? s->ended : s->before, back = motion_to_root(&c->motion);
+    /* A root out of the last step is none of the motion: an input drives the guard, whose own rate is rounding. */
+    s->back = back > 64.0 * 2.3e-16 * fabs(s->t) || (s->last < step && s->t + back < step) ? 0.0 : back;
     if (s->t + s->back < s->last) s->back = s->last - s->t;
   }
   s->phase = EVENT_MODE;
@@ -480,7 +482,9 @@ fmi3Status fmi3CompletedIntegratorStep(fmi3Instance instance, fmi3Boolean noSetS
                                        fmi3Boolean *enterEventMode, fmi3Boolean *terminate) {
   SELF;
   double y[STATES];
-  memcpy(y, c->motion.s.y, sizeof y);
+  State *s = &c->motion.s;
+  memcpy(y, s->y, sizeof y);
+  if (s->ended < s->t) s->before = s->ended, s->ended = s->t;
   *terminate = false;
   /* An event moves the state back onto constraints, and to zero slip in stick; an importer may have missed another. */
   *enterEventMode = motion_project(&c->motion, y) > 0.5 || motion_violated(&c->motion);

@@ -11,6 +11,7 @@ typedef struct {
   double t, numbers[SPACE(NUMBERS)], y[STATES], mode[SPACE(MODES)];
   double rtol, atol;
   double step;                /* length of the next step, 0 if unknown */
+  double ended, before; /* ends of the last two steps of an importer */
   double begin, last, spread; /* start, last event, the longest of the last intervals between events */
   double back;                /* time from the instant of an importer to the root of the event there */
   double fired[SPACE(MODES)]; /* guards whose event is pending */
