@@ -298,7 +298,9 @@ static int mark(Motion *c, double near, int first) {
     const double left = above(g, i);
     /* The gap of a contact that opens has a velocity of rounding, of either sign, which does not close it again. */
     const int comes = rates[i] < -c->tolerances[0] && left >= 0.0 && left <= -rates[i] * near;
-    const int beyond = g[i] < 0.0 && (rates[i] <= 0.0 || g[i] < -g[MODES + i]);
+    /* In stick the load has a rate of rounding where an input drives it. */
+    const double falls = i < SLIPS ? c->tolerances[0] : 0.0;
+    const int beyond = g[i] < 0.0 && (rates[i] <= falls || g[i] < -g[MODES + i]);
     if (g[i] > 0.0) s->waits[i] = 0;
     s->fired[i] = i == first || (!s->waits[i] && (comes || beyond));
     s->pending |= s->fired[i] != 0.0;
