@@ -19,6 +19,8 @@ from jaxmodsim.control import FrictionFilter
 from jaxmodsim.scene import State, replace_elements, scene_step
 
 LEVEL, HEALTHY, NOISE, H = "friction.normal_force", 1.1, 1e-5, 5e-3
+# Steps of the true motion in one of the filter, whose own steps would be too good a model.
+FINE = 100
 
 
 def energy(_t, _q, qd, p):
@@ -42,7 +44,8 @@ def record(axis, t, u):
     def step(y, each):
         t0, u = each
         worn = replace_elements(axis, {"u": u, LEVEL: true_level(t0)})
-        y, _ = scene_step(worn, t0, t0 + H, y)
+        h = H / FINE
+        y = jax.lax.fori_loop(0, FINE, lambda k, y: scene_step(worn, t0 + k * h, t0 + k * h + h, y)[0], y)
         return y, y.q
 
     rest = State(jnp.zeros(1), jnp.zeros(1), axis.initial_state(jnp.zeros(1)))
