@@ -146,7 +146,8 @@ def need_values(tree: eqx.Module, wanted: str) -> None:
     if is_state_dependent(tree):
         raise ValueError(
             f"{wanted} needs the numbers of the law, but parameters of this {type(tree).__name__} depend on the state"
-            " of the mechanism (scaled_by, or a torque). Pass the law at a state, law.bind_state(t, q, qd, params)."
+            " of the mechanism (scaled_by, or a torque). Pass the law at a state, law.bind_state(t, q, qd, params). A"
+            " torque that is the name of a constraint needs a number."
         )
 
 

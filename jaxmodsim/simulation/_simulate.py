@@ -75,8 +75,9 @@ def simulate(
     - `z0`: initial states of effects, by effect name; others start at rest.
     - `rtol`, `atol`: relative and absolute tolerance of the local error. Values below `atol` are not resolved: choose
       it below the smallest velocity [m/s] and deflection [m] that matter. It must not be above the width of a
-      `Regularized` law. `rtol` below 64 roundings (8e-6 in float32, 1.4e-14 in float64) counts as that. The rounding of
-      n steps in float32 is about 6e-8 sqrt(n) of the state; if that exceeds `rtol`, one warning is logged.
+      `Regularized` law. `rtol` below 64 roundings (8e-6 in float32, 1.4e-14 in float64) counts as that, and `atol`
+      rises by the same factor. The rounding of n steps in float32 is about 6e-8 sqrt(n) of the state; if that exceeds
+      `rtol`, one warning is logged.
     - `dt`: fixed step [s], > 0, instead of tolerances. A sample of a `Signal` within a step divides it. Derivatives
       of a scene at rest need `dt` below 2 over its fastest rate [1/s] with explicit solvers; outside `jax.jit` a
       longer step logs one warning.

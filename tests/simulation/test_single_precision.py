@@ -230,7 +230,8 @@ def test_a_slip_that_nearly_stays_ends_at_its_root() -> None:
         rubs = jms.Friction(jms.Coulomb(F(0.05)), along=slip)
         scene = jms.Scene(kinetic, {"F": F(0.05)}, (jms.AppliedForce(drive), rubs))
         start = jnp.stack([V + 1.0 - depth, V])
-        run = jms.simulate(scene, np.zeros(2, F), start, F(1.5), throw=False, record=("events",), max_events=8)
+        fine: dict[str, Any] = {"rtol": 8e-6, "atol": 1e-9, "record": ("events",), "max_events": 8}
+        run = jms.simulate(scene, np.zeros(2, F), start, F(1.5), throw=False, **fine)
         return run.events.t[0], run.result.code
 
     # Depths above the rounding of the slip, 1e-6 V.
