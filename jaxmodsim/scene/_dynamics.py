@@ -493,13 +493,16 @@ def _loads(
     chosen = dict(zip(scene.constraint_names, scene.constraints, strict=True))
     at = jnp.concatenate([where[name] for name in names])
     size = jnp.stack([chosen[name].per_multiplier(t, y.q, scene.params) for name in names])
-    on = jnp.asarray([[float(name == each) for name in names] for each in loaded], y.q.dtype)
+    loads = np.array([[name == each for name in names] for each in loaded])
+    on = jnp.asarray(loads, y.q.dtype)
     drives: list[Scalar | None] = [None for _ in rows]
     for i, (element, row) in enumerate(rows):
         if element.transmits:
             k, square = names.index(loaded[i] or ""), jnp.sum(row * row)
-            torque = -jnp.sum(constraints[at[k]] * row) / (size[k] * jnp.where(square > 0, square, 1.0))
-            on, drives[i] = on.at[i, k].set(jnp.abs(torque)), jnp.where(torque < 0, -1.0, 1.0)
+            torque = -jnp.sum(jnp.unstack(constraints[at])[k] * row)
+            torque = torque / (jnp.unstack(size)[k] * jnp.where(square > 0, square, 1.0))
+            on = jnp.where(loads & (np.arange(len(rows)) == i)[:, None], jnp.abs(torque), on)
+            drives[i] = jnp.where(torque < 0, -1.0, 1.0)
     return Loads(
         on,
         size * multipliers[at],

@@ -80,6 +80,19 @@ def skate() -> jms.Scene:
     return jms.Scene(lagrangian, {"g": 2.0}, constraints=(blade,))
 
 
+def rigid_gear() -> jms.Scene:
+    """Two shafts, whose torques reverse that in the mesh."""
+
+    def torques(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del q, qd
+        return jnp.stack([p["f"] * jnp.sin(4.1 * t - 2.1), 4.5 * jnp.sin(4.7 * t + 0.8)])
+
+    law = jms.Geared(jms.Coulomb(0.3), 0.6, "mesh", 0.5)
+    effects = jms.AppliedForce(torques), jms.Friction(law, along=lambda q: q[0], name="gear")
+    mesh = jms.Constraint(lambda t, q, p: q[0] - 1.5 * q[1], name="mesh")
+    return jms.Scene(mass, {"m": 1.0, "f": 3.0}, effects, (mesh,))
+
+
 # Scene, start, end, largest error of coordinates at rtol 1e-6, and of event times.
 CASES: dict[str, Callable[[], tuple[Any, Any, Any, float, float, float]]] = {
     "box": lambda: (ramped_box.scene(ramped_box.lugre()), [0.0], [0.0], 10.0, 2e-6, 0.0),
@@ -95,14 +108,15 @@ CASES: dict[str, Callable[[], tuple[Any, Any, Any, float, float, float]]] = {
     ),
 }
 NAMES = ["box", "belt", "ball", "pendulum", "crank"]
-# Friction in the plane, a switch, two stops, and a velocity constraint; validation and derivatives are as above.
+# Friction in the plane, a switch, stops, a velocity constraint, a gear; validation and derivatives are as above.
 CASES |= {
     "puck": lambda: (puck(), [0.0, 0.0], [3.0, 4.0], 10.0, 1e-7, 0.0),
     "switch": lambda: (switched_spring(), [-1.0], [1.0], 6.0, 1e-7, 1e-6),
     "stops": lambda: (end_stops(), [0.0], [0.3], 3.0, 1e-7, 0.0),
     "skate": lambda: (skate(), [0.0, 0.0, 0.0], [1.0, 0.0, 1.0], 3.0, 1e-7, 0.0),
+    "gear": lambda: (rigid_gear(), [0.0, 0.0], [0.0, 0.0], 4.0, 2e-6, 0.0),
 }
-OTHERS = ["puck", "switch", "stops", "skate"]
+OTHERS = ["puck", "switch", "stops", "skate", "gear"]
 
 
 @functools.cache

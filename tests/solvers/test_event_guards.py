@@ -23,18 +23,16 @@ FALLS: dict[str, tuple[Any, bool, float | None]] = {
     "dips between two samples": (lambda s: (s - 0.42) ** 2 - 1e-3, True, 0.42 - 1e-3**0.5),
     "violated, not armed": (lambda s: -0.1 - s, False, None),
     "violated, armed": (lambda s: -0.1 - s, True, 0.0),
-    "violated, armed, and positive at every other sample": (lambda s: s - 0.1, True, 0.0),
     "zero and rising, not armed": (lambda s: s * (0.8 - s), False, 0.8),
     "zero and rising, back before a sample": (lambda s: s * (0.2 - s), False, 0.2),
 }
 
 
-def scan(fn: Any, armed: bool) -> GuardScan:
+def scan(fn: Any, armed: bool, violated: bool = False) -> GuardScan:
     values = [jnp.asarray([fn(s)]) for s in (0.0, 1 / 3, 2 / 3, 1.0)]
     middle, tolerances = jnp.asarray([fn(0.5)]), (jnp.asarray(1e-9), jnp.zeros(1))
-    return scan_guards(
-        (values[0], values[1], values[2], values[3]), middle, jnp.array([armed]), tolerances, 0 * ONE, ONE
-    )
+    flags = jnp.array([armed]), jnp.array([violated])
+    return scan_guards((values[0], values[1], values[2], values[3]), middle, *flags, tolerances, 0 * ONE, ONE)
 
 
 @pytest.mark.parametrize("name", FALLS)
@@ -43,6 +41,13 @@ def test_first_falls_of_cubics_are_found_as_aims_of_a_step(name: str) -> None:
     seen = scan(fn, armed)
     assert bool(seen.crosses[0]) == (event is not None)
     np.testing.assert_allclose(first_root(seen, seen.crosses), 1.0 if event is None else event, atol=1e-6)
+
+
+def test_a_guard_that_an_event_has_violated_falls_at_once_although_it_rises() -> None:
+    for violated in (True, False):
+        seen = scan(lambda s: s - 0.1, True, violated)
+        assert bool(seen.crosses[0]) == violated
+        assert first_root(seen, seen.crosses) == (0.0 if violated else 1.0)
 
 
 def test_oscillations_within_a_step_are_not_resolved() -> None:

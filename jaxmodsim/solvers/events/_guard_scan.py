@@ -61,6 +61,7 @@ def scan_guards(
     values: tuple[Numbers, Numbers, Numbers, Numbers],
     middle: Numbers,
     armed: Flags,
+    violated: Flags,
     tolerances: tuple[Float[Array, ""], Numbers],
     blur: Float[Array, ""],
     unit: Float[Array, ""],
@@ -79,8 +80,9 @@ def scan_guards(
 
     - `values`: at 0, 1/3, 2/3 and 1, shape `[n]` each.
     - `middle`: at 1/2, shape `[n]`.
-    - `armed`: whether a function counts as positive at the start, whatever its value there. If it is armed and
-      negative there, or zero and does not rise, it falls at once.
+    - `armed`: whether a function counts as positive at the start, whatever its value there. If it is armed, not
+      positive and does not rise, it falls at once.
+    - `violated`: whether an event at the start has made a function negative, so that it falls at once if it rises, too.
     - `tolerances`: depth of a fall that may be missed, relative to the largest magnitude in the step, and absolute.
     - `blur`: rounding error of the points, as a fraction of the step.
     - `unit`: an `opaque_one`.
@@ -139,7 +141,7 @@ def scan_guards(
         start, high = jnp.where(later, point, start), jnp.where(later, value, high)
     # Not left of the middle of the bracket: a function that rises from zero has a root at the start, which is no fall.
     secant = start + (end - start) * jnp.clip(high / jnp.where(high > low, high - low, 1.0), 0.5, 1.0)
-    at_once = armed & ((g0 < -tolerance) | ((g0 <= 0) & (g1 < 0) & (c1 <= 0)))
+    at_once = (violated & (g0 < -tolerance)) | (armed & (g0 <= 0) & (g1 < 0) & (c1 <= 0))
     root = fusion_barrier(jnp.where(at_once, 0.0, jnp.where(crosses, secant, 1.0)), unit)
     crosses = root < 1.0
 

@@ -258,7 +258,10 @@ class EventSolver(AbstractSolverWrapper):
         inner = self.solver.init(dfx.ODETerm(_Field(terms)), t0, t1, y0.y, (y0, args))
         guard, first = self._guards(*_held((t0, y0, args))), _constant(t1 - t0)
         none, armed = jnp.zeros((), int), self._policy.armed_at_start(guard)
-        return inner, EventMemory(guard, armed, none, none, jnp.zeros_like(first), first, _constant(t0 - (t1 - t0)))
+        fresh = EventMemory(
+            guard, armed, ~armed & False, none, none, jnp.zeros_like(first), first, _constant(t0 - (t1 - t0))
+        )
+        return inner, fresh
 
     def step(
         self, terms: PyTree, t0: Real, t1: Real, y0: EventState, args: PyTree, solver_state: PyTree, made_jump: Real
@@ -299,7 +302,11 @@ class EventSolver(AbstractSolverWrapper):
         report = StepReport(landed, landing.next_root, fusion_barrier(factor, unit))
         pace = jnp.maximum(measure, _FORGET_STEPS * memory.pace)
         end, root, _ = ends
-        at_end = y0._replace(y=y1, report=report), memory._replace(guard=end, armed=seen.armed, pace=pace)
+        sound = jnp.zeros_like(memory.violated)
+        at_end = (
+            y0._replace(y=y1, report=report),
+            memory._replace(guard=end, armed=seen.armed, violated=sound, pace=pace),
+        )
         (state1, memory), (t_event, slope) = jax.lax.cond(
             landing.happens,
             lambda: self._jump(terms, t1, at_end, landing, (root, landing.near * length), (args, whole)),
@@ -333,7 +340,8 @@ class EventSolver(AbstractSolverWrapper):
         # If limits vanish at one end of the step, the other end gives their size.
         tolerances = jnp.asarray(_constant(self.rtol), end.dtype), _constant(jnp.maximum(atol[0], atol[-1]))
         blur = _constant(resolution) / jnp.where(length > 0, length, 1.0)
-        seen = scan_guards((memory.guard, one, two, end), middle, memory.armed, tolerances, blur, unit)
+        flags = memory.armed, memory.violated
+        seen = scan_guards((memory.guard, one, two, end), middle, *flags, tolerances, blur, unit)
         return seen, end, _constant(root[-1]), _constant(jnp.where(root[-1] < atol[-1], root[-1], 0.0))
 
     def _land(
@@ -462,7 +470,8 @@ class EventSolver(AbstractSolverWrapper):
         flags = _flags(fired, values)
         entry = EventLog(t_event, flags, each, (passage.before, state.mode), (y, mode))
         log = None if state.log is None else jtu.tree_map(lambda a, b: write(a, index, b), state.log, entry)
-        passed = state._replace(y=passage.y, mode=mode), memory._replace(guard=_constant(values), armed=armed)
+        guard, violated = _constant(values), ~fired & (values < 0) & self.enforce
+        passed = state._replace(y=passage.y, mode=mode), memory._replace(guard=guard, armed=armed, violated=violated)
         after_reset = (
             passed[0]._replace(t=t_event, events=events, status=status, fired=flags, log=log),
             passed[1]._replace(resets=memory.resets + 1, alone=alone, spread=spread),

@@ -74,6 +74,7 @@ class EventMemory(NamedTuple):
     """Memory of `EventSolver` from step to step, beside the state of the wrapped solver; constant in derivatives.
 
     - `guard`, `armed`: values of the guards at the end of the last step, and which are armed, shape `[guards]`.
+    - `violated`: conditions that the last step's event has made negative, beside those that fired, shape `[guards]`.
     - `resets`: number of calls of `reset`. `alone`: of the last ones by guards that do not carry on.
     - `spread`: the longest of the last intervals between them [time].
     - `pace`: the longest of the last steps [time].
@@ -82,6 +83,7 @@ class EventMemory(NamedTuple):
 
     guard: Float[Array, " guards"]
     armed: Bool[Array, " guards"]
+    violated: Bool[Array, " guards"]
     resets: Int[Array, ""]
     alone: Int[Array, ""]
     spread: Float[Array, ""]
