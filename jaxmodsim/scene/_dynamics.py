@@ -326,10 +326,8 @@ class Dynamics(NamedTuple):
             return none, none
         assert self.friction is not None
         assert self.friction_elements.loads is not None
-        at, loads = (
-            np.array([self.scene.loaded.index(name) for name in self.scene.guides]),
-            self.friction_elements.loads,
-        )
+        loads = self.friction_elements.loads
+        at = np.array([self.scene.loaded.index(name) for name in self.scene.guides])
         unit = _ROUNDING * float(jnp.finfo(self.t.dtype).eps)
         cancelled = jax.lax.stop_gradient(jnp.abs(loads.normal_coupling) * jnp.abs(self.friction.force)[None, :])
         return self.friction.normal[at], (loads.rounding + unit * jnp.sum(cancelled, axis=1))[at]

@@ -313,7 +313,8 @@ def solve_friction_forces(
         slipping = jnp.where(sticks, 0.0, slip_force)
         drive = elements.free_slip_acceleration - apply_matrix(elements.delassus, slipping)
         force = jnp.where(sticks, _multipliers(elements, drive, sticks), slip_force)
-        return FrictionForces(force, *elements.laws[2:], jnp.ones_like(elements.v[0]), force[:0])
+        limits = elements.laws.upper, elements.laws.lower
+        return FrictionForces(force, *limits, jnp.ones_like(elements.v[0]), force[:0])
     # Forces are linear in the loads. Columns: the slip forces without loads, beside the accelerations without friction;
     # then the slip forces by one newton of each load alone, and those of gears once more by one newton of pull.
     (on, normal, coupling, pulls, side, *_), gears = elements.loads, elements.gears
@@ -333,11 +334,12 @@ def solve_friction_forces(
     load = jnp.where(pushes, 1.0, pulls) * signed
     force = fixed + apply_matrix(push if gears is None else jnp.where(pushes[None], push, pull), load)
     factor = jnp.where(loaded > 0, apply_matrix(on, load), 1.0)
-    limits = [factor * limit for limit in elements.laws[2:]]
+    upper, lower = (factor * limit for limit in elements.laws[2:])
     if gears is not None:
         pulled = apply_matrix(on, jnp.where(pushes, 0.0, load))
-        limits = [x + alone + pulled * more for x, alone, more in zip(limits, gears[0][2:], gears[1][2:], strict=True)]
-    return FrictionForces(force, *limits, margin, signed)
+        upper = upper + gears[0].upper + pulled * gears[1].upper
+        lower = lower + gears[0].lower + pulled * gears[1].lower
+    return FrictionForces(force, upper, lower, margin, signed)
 
 
 def _slip_force(laws: LawForces, mode: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -50,8 +50,8 @@ def random_contact(rng: np.random.Generator, n: int, stiction: bool) -> Friction
     level = limit * rng.uniform(0.5, 1.0, n) if stiction else limit
     base = 3.0 * rng.normal(size=n) * np.diag(coupling)
     numbers = (np.zeros(n), base, coupling, directions, level, -level, limit, limit)
-    numbers = [jnp.asarray(x) for x in numbers]
-    return FrictionElements(*numbers[:4], LawForces(*numbers[4:]))
+    v, free, delassus, minv_jt, *laws = (jnp.asarray(x) for x in numbers)
+    return FrictionElements(v, free, delassus, minv_jt, LawForces(*laws))
 
 
 @jax.jit

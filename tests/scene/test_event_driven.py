@@ -36,8 +36,8 @@ def scalars(**numbers: Any) -> FrictionElements:
         "lower": [1.0, 1.0],
     }
     loads, gears = numbers.pop("loads", None), numbers.pop("gears", None)
-    values = [jnp.asarray(x, float) for x in (usual | numbers).values()]
-    return FrictionElements(*values[:4], LawForces(*values[4:]), loads=loads, gears=gears)
+    v, free, delassus, minv_jt, *laws = (jnp.asarray(x, float) for x in (usual | numbers).values())
+    return FrictionElements(v, free, delassus, minv_jt, LawForces(*laws), loads=loads, gears=gears)
 
 
 def plane(v: Any, free: Any = (0.0, 0.0, 0.0)) -> FrictionElements:
@@ -45,8 +45,9 @@ def plane(v: Any, free: Any = (0.0, 0.0, 0.0)) -> FrictionElements:
     limit = jnp.array([2.0, 2.0, 1.0])
     force, onset = jnp.array([0.3, 0.4, 0.0]), jnp.array([1.5, 1.5, 0.0])
     unused = jnp.array([jnp.nan, jnp.nan, 1.0])
-    laws, motion = LawForces(unused, -unused, limit, limit), (jnp.asarray(v, float), jnp.asarray(free, float))
-    return FrictionElements(*motion, jnp.eye(3), jnp.eye(3), laws, PlanarSlip(force, onset), planes=((0, 2),))
+    laws, one = LawForces(unused, -unused, limit, limit), jnp.eye(3)
+    v, free = jnp.asarray(v, float), jnp.asarray(free, float)
+    return FrictionElements(v, free, one, one, laws, PlanarSlip(force, onset), planes=((0, 2),))
 
 
 def test_stick_takes_the_acceleration_that_slip_leaves() -> None:

@@ -156,7 +156,7 @@ class Friction(AbstractEffect, AbstractRanged):
     @property
     def load_constraint(self) -> str | None:
         """Name of the constraint whose reaction is the load, or the torque of a gear; None for others."""
-        reaction = self.law.torque if self.transmits else self.normal_force
+        reaction = getattr(self.law, "torque", None) if self.transmits else self.normal_force
         return reaction.constraint if isinstance(reaction, Reaction) else None
 
     @property

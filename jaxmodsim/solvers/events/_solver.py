@@ -258,10 +258,8 @@ class EventSolver(AbstractSolverWrapper):
         inner = self.solver.init(dfx.ODETerm(_Field(terms)), t0, t1, y0.y, (y0, args))
         guard, first = self._guards(*_held((t0, y0, args))), _constant(t1 - t0)
         none, armed = jnp.zeros((), int), self._policy.armed_at_start(guard)
-        fresh = EventMemory(
-            guard, armed, ~armed & False, none, none, jnp.zeros_like(first), first, _constant(t0 - (t1 - t0))
-        )
-        return inner, fresh
+        sound, begin = jnp.zeros_like(armed), _constant(t0 - (t1 - t0))
+        return inner, EventMemory(guard, armed, sound, none, none, jnp.zeros_like(first), first, begin)
 
     def step(
         self, terms: PyTree, t0: Real, t1: Real, y0: EventState, args: PyTree, solver_state: PyTree, made_jump: Real
@@ -302,11 +300,8 @@ class EventSolver(AbstractSolverWrapper):
         report = StepReport(landed, landing.next_root, fusion_barrier(factor, unit))
         pace = jnp.maximum(measure, _FORGET_STEPS * memory.pace)
         end, root, _ = ends
-        sound = jnp.zeros_like(memory.violated)
-        at_end = (
-            y0._replace(y=y1, report=report),
-            memory._replace(guard=end, armed=seen.armed, violated=sound, pace=pace),
-        )
+        memory = memory._replace(guard=end, armed=seen.armed, violated=jnp.zeros_like(seen.armed), pace=pace)
+        at_end = y0._replace(y=y1, report=report), memory
         (state1, memory), (t_event, slope) = jax.lax.cond(
             landing.happens,
             lambda: self._jump(terms, t1, at_end, landing, (root, landing.near * length), (args, whole)),
