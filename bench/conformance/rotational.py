@@ -272,7 +272,7 @@ CASES = (
         "LossyGearDemo3", lossy_gear_demo3, {"J1": 1e-3, "J2": 1e-3, "bearing": 0.5}, 1.0,
         _INERTIA_2, _second, (0.099999999016922012, -1.0000009709187907e-09),
         references.lossy_gear_demo3, by=("bearing",), modes=((0.020000000002, "gear stick"),),
-        note="As before.",
+        note="As before. By one inertia alone the torque between the teeth has a kink at zero: no derivative.",
     ),
     _case(
         "Backlash", backlash, {"J": 5.0, "c": 20e3, "d": 50.0, "b": 0.7853981633974483}, 1.0,

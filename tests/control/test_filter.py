@@ -221,7 +221,7 @@ def test_innovations_of_a_measured_axis_are_not_white() -> None:
     law = jms.Regularized(jms.Stribeck(Fc=20.3935, Fs=20.3935, vs=0.01, Fv=203.5034), 1e-3)
     drive = jms.AppliedForce(lambda t, q, qd, p: jnp.reshape(p["u"] + 3.1648, (1,)))
     scene = jms.Scene(energy, {"m": 95.1089, "u": 0.0}, (drive, jms.Friction(law, normal_force=1.0)))
-    filter = FrictionFilter(scene, noise=2e-8, drift={"qd[0]": 1e-3, LEVEL: 0.2}, numbers=(LEVEL,))
+    filter = FrictionFilter(scene, noise=2e-8, drift={"qd[0]": 9.3e-4, LEVEL: 0.2}, numbers=(LEVEL,))
     start = filter.start([q[0]], [0.0], {"q[0]": 1e-5, "qd[0]": 1e-3, LEVEL: 0.2})
     run = filter.run(t, q[:, None], {"u": 35.15065188248547 * u}, start)
     white = np.asarray(run.innovation[1:, 0])
