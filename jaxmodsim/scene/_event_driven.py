@@ -43,6 +43,8 @@ _SHRUNK, _GROWN = 0.1, 1e4
 _SLOWEST = 1e6
 # Slip in a plane that friction stops within this many rounding units of time counts as rest.
 _INSTANT = 1e-3
+# A rounding unit below this leaves the slip of held elements below the speed of rest.
+_DOUBLE = 1e-12
 # Slip in a plane has ended where it reverses and its component across is at most this multiple of the speed of rest.
 _ENDED = 1e5
 
@@ -462,11 +464,17 @@ def friction_guards(
 
 
 def speed_of_rest(elements: FrictionElements, forces: FrictionForces, rest: Scalar, t: Scalar) -> Scalar:
-    """The speed of rest [m/s]: `rest`, in planes at least the speed that time resolves at the end of a slip."""
-    if not elements.planes:
+    """The speed of rest [m/s]: `rest`, in planes at least the speed that time resolves at the end of a slip.
+
+    In single precision that holds for several scalar rows, too. A row at its limit that others hold has a slip of
+    rounding errors, which are larger than `rest`: its guard would be resolved in thousands of steps.
+    """
+    eps = float(jnp.finfo(t.dtype).eps)
+    if not elements.planes and (elements.v.shape[0] == 1 or eps < _DOUBLE):
         return rest
     slows = jnp.max(jnp.sum(jnp.abs(elements.delassus) * forces.upper[None, :], axis=1))
-    return jnp.maximum(rest, _INSTANT * float(jnp.finfo(t.dtype).eps) * jnp.abs(t) * _constant(slows))
+    instant = eps * jnp.abs(t) * _constant(slows)
+    return jnp.maximum(rest, _INSTANT * instant if elements.planes else instant)
 
 
 def _components(v: Float[Array, " d"], reference: Float[Array, " d"]) -> tuple[Scalar, Scalar, Scalar]:

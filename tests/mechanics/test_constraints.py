@@ -360,6 +360,25 @@ def test_stick_within_a_constraint_takes_few_steps_in_single_precision() -> None
     assert int(run.stats["num_steps"]) < 150
 
 
+def test_a_row_that_others_hold_takes_few_steps_in_single_precision() -> None:
+    """Its load passes zero at 1 s, from where its slip at the limit is rounding, and has its limit back at once."""
+
+    def push(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del q, qd, p
+        return jnp.stack([0.6 * jnp.sin(2.0 * t), 1.0 - t])
+
+    real = jnp.float32
+    friction = (
+        Friction(Coulomb(real(0.5)), along=lambda q: q[0], normal_force="guide"),
+        Friction(Coulomb(real(0.7)), along=lambda q: q[0], name="other"),
+    )
+    guide = Constraint(lambda t, q, p: q[1], name="guide")
+    scene = Scene(free, effects=(AppliedForce(push), *friction), constraints=(guide,))
+    run = simulate(scene, jnp.zeros(2, real), jnp.zeros(2, real), real(3.0))
+    assert float(jnp.max(jnp.abs(run.q))) < 1e-8
+    assert int(run.stats["num_steps"]) < 200
+
+
 def all_loads(normal: Any, push: Any, pull: Any) -> list[Any]:
     """Every solution of n + G n = normal with columns of `push` for n > 0, and of `pull`, by trying all signs."""
     found = []
