@@ -9,6 +9,9 @@ from bench.conformance.case import Case, Numbers, Reference, Setup
 from bench.conformance.motion import Path, Wave, driven, integrated, linear
 from jaxmodsim.friction import lorentzian
 
+# Initial height of the centre of the rocking block [m]: a block of 1 m by 0.5 m stands on a corner at 60 degrees.
+HEIGHT = 0.5 * np.sin(np.pi / 3.0) + 0.25 * np.cos(np.pi / 3.0)
+
 
 def pulled_lugre(p: Numbers) -> Setup:
     """A mass pulled through a spring at 0.1 m/s, with LuGre friction."""
@@ -135,6 +138,39 @@ def exact_impacting_stick(m, length, g, e, mu) -> Reference:
     return Reference(path.y, path.events)
 
 
+def rocking_block(p: Numbers) -> Setup:
+    """A block that falls on the corners of its lower side without friction; coordinates are its height and angle."""
+
+    def lagrangian(t, q, qd, p):
+        return 0.5 * (p["m"] * qd[0] ** 2 + p["J"] * qd[1] ** 2) - p["m"] * p["g"] * q[0]
+
+    def corner(side):
+        return lambda t, q, p: q[0] + 0.5 * (side * p["length"] * jnp.sin(q[1]) - p["height"] * jnp.cos(q[1]))
+
+    contacts = [jms.Contact(corner(i), restitution=p["e"], name=name) for i, name in ((-1.0, "left"), (1.0, "right"))]
+    params = {name: p[name] for name in ("m", "J", "g", "length", "height")}
+    scene = jms.Scene(lagrangian, params, constraints=contacts)
+    return Setup(scene, np.array([HEIGHT, np.pi / 3.0]), np.zeros(2))
+
+
+def exact_rocking_block(m, J, g, length, height, e, step=0.0) -> Reference:
+    """Free flight in closed form, and an impact of one corner at a time; with a `step`, impulses are its multiples."""
+    sides, mass = np.array([-1.0, 1.0]), np.array([m, J])
+    path = Path([HEIGHT, np.pi / 3.0, 0.0, 0.0])
+    flight = driven([([-1.0, 0.0], Wave(g))])
+
+    def gaps(t, y):
+        return y[0] + 0.5 * (sides * length * np.sin(y[1]) - height * np.cos(y[1]))
+
+    while (i := path.to_first(flight, gaps, 2.0)) is not None:
+        arm = 0.5 * (sides[i] * length * np.cos(path.y[1]) + height * np.sin(path.y[1]))
+        normal, v = np.array([1.0, arm]), path.y[2:]
+        impulse = -(1.0 + e) * (normal @ v) / (normal / mass @ normal)
+        path.y[2:] = v + (np.ceil(impulse / step) * step if step else impulse) * normal / mass
+        path.log(("left open", "right open")[i])
+    return Reference(path.y, path.events)
+
+
 def _case(name, source, make, numbers, t1, outputs, observe, published, reference, **more) -> Case:
     return Case(
         name, source, numbers, make, t1, outputs, observe, lambda **n: reference(*n.values()), published, **more
@@ -181,5 +217,20 @@ CASES = (
          3.212070578753687), exact_impacting_stick, by=("g", "e", "mu"), compared=("floor",),
         results="siconos/siconos-tutorials @ b6c9bfd1, examples/mechanics/ImpactingStick/ImpactingStick.ref",
         note="Published: Moreau-Jean time-stepping of first order with steps of 0.1 ms.",
+    ),
+    _case(
+        "Siconos RockingBlock",
+        "siconos/siconos-tutorials @ b6c9bfd1, examples/mechanics/RockingBlock/RockingBlockED_Lsodar_LZBimpact.cpp",
+        rocking_block, {"m": 1.0, "J": 1.25 / 12.0, "g": 9.81, "length": 0.2, "height": 0.1, "e": 0.8}, 2.0,
+        ("y [m]", "angle [rad]", "dy/dt [m/s]", "rate [rad/s]"), lambda q, qd: (*q, *qd),
+        (0.06718552403460872, -2.093984548445607, 0.07069999999445728, -4.152292733753275), exact_rocking_block,
+        by=("g", "J", "e"),
+        modes=((0.3016807020283281, "left open"), (0.7850142235821842, "left open"), (1.178736161714749, "left open"),
+               (1.41752252299837, "right open"), (1.64974638740134, "right open"), (1.835747166785115, "right open"),
+               (1.989038206431418, "right open")),
+        results="siconos/siconos-tutorials @ b6c9bfd1, examples/mechanics/RockingBlock/"
+                "RockingBlockED_Lsodar_LZBimpact.ref",
+        note="Published: LSODAR from impact to impact, with impulses in steps of 5e-5 N s. The mass and the inertia are"
+             " those of a block of 1 m by 0.5 m, and the corners those of a block of 0.2 m by 0.1 m.",
     ),
 )  # fmt: skip
