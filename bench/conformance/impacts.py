@@ -12,6 +12,9 @@ from jaxmodsim.friction import lorentzian
 # Initial height of the centre of the rocking block [m]: a block of 1 m by 0.5 m stands on a corner at 60 degrees.
 HEIGHT = 0.5 * np.sin(np.pi / 3.0) + 0.25 * np.cos(np.pi / 3.0)
 
+BLOCK = "siconos/siconos-tutorials @ b6c9bfd1, examples/mechanics/RockingBlock/{}"
+_BLOCK = ("y [m]", "angle [rad]", "dy/dt [m/s]", "rate [rad/s]")
+
 
 def pulled_lugre(p: Numbers) -> Setup:
     """A mass pulled through a spring at 0.1 m/s, with LuGre friction."""
@@ -139,7 +142,7 @@ def exact_impacting_stick(m, length, g, e, mu) -> Reference:
 
 
 def rocking_block(p: Numbers) -> Setup:
-    """A block that falls on the corners of its lower side without friction; coordinates are its height and angle."""
+    """A block that falls on the corners of its lower side, free of friction; coordinates are its height and angle."""
 
     def lagrangian(t, q, qd, p):
         return 0.5 * (p["m"] * qd[0] ** 2 + p["J"] * qd[1] ** 2) - p["m"] * p["g"] * q[0]
@@ -151,6 +154,11 @@ def rocking_block(p: Numbers) -> Setup:
     params = {name: p[name] for name in ("m", "J", "g", "length", "height")}
     scene = jms.Scene(lagrangian, params, constraints=contacts)
     return Setup(scene, np.array([HEIGHT, np.pi / 3.0]), np.zeros(2))
+
+
+def flat_block(p: Numbers) -> Setup:
+    """The block falls flat, and both corners strike at once."""
+    return rocking_block(p)._replace(q0=np.array([0.5, 0.0]))
 
 
 def exact_rocking_block(m, J, g, length, height, e, step=0.0) -> Reference:
@@ -169,6 +177,38 @@ def exact_rocking_block(m, J, g, length, height, e, step=0.0) -> Reference:
         path.y[2:] = v + (np.ceil(impulse / step) * step if step else impulse) * normal / mass
         path.log(("left open", "right open")[i])
     return Reference(path.y, path.events)
+
+
+def exact_flat_block(m, J, g, length, height, e) -> Reference:
+    """A bouncing ball."""
+    path = Path([0.5, 0.0, 0.0, 0.0])
+    while path.to_zero(driven([([-1.0, 0.0], Wave(g))]), lambda t, y: y[0] - 0.5 * height, 2.0):
+        path.log("left open", "right open")
+        path.y[2] *= -e
+    return Reference(path.y, path.events)
+
+
+def exact_block_on_a_corner(m, J, g, length, height, e) -> Reference:
+    """The left corner slides on the ground, and the right one bounces from it: an equation of the angle alone.
+
+    At an impact of the right corner, Newton's law keeps the left one at rest: its impulse is positive for
+    `m length^2 > 4 J`, as that of the right one pushes it down.
+    """
+
+    def slopes(angle):
+        sin, cos = np.sin(angle), np.cos(angle)
+        return 0.5 * (length * cos - height * sin), -0.5 * (length * sin + height * cos)
+
+    def field(t, y):
+        first, second = slopes(y[0])
+        return np.array([y[1], -m * first * (second * y[1] ** 2 + g) / (J + m * first**2)])
+
+    path = Path([np.pi / 3.0, 0.0])
+    while path.to_zero(integrated(field), lambda t, y: y[0], 1.2, "right open"):
+        path.y[:] = 0.0, -e * path.y[1]
+    angle, rate = path.y
+    centre = 0.5 * (length * np.sin(angle) + height * np.cos(angle))
+    return Reference(np.array([centre, angle, slopes(angle)[0] * rate, rate]), path.events)
 
 
 def _case(name, source, make, numbers, t1, outputs, observe, published, reference, **more) -> Case:
@@ -220,17 +260,29 @@ CASES = (
     ),
     _case(
         "Siconos RockingBlock",
-        "siconos/siconos-tutorials @ b6c9bfd1, examples/mechanics/RockingBlock/RockingBlockED_Lsodar_LZBimpact.cpp",
+        BLOCK.format("RockingBlockED_Lsodar_LZBimpact.cpp"),
         rocking_block, {"m": 1.0, "J": 1.25 / 12.0, "g": 9.81, "length": 0.2, "height": 0.1, "e": 0.8}, 2.0,
-        ("y [m]", "angle [rad]", "dy/dt [m/s]", "rate [rad/s]"), lambda q, qd: (*q, *qd),
+        _BLOCK, lambda q, qd: (*q, *qd),
         (0.06718552403460872, -2.093984548445607, 0.07069999999445728, -4.152292733753275), exact_rocking_block,
         by=("g", "J", "e"),
         modes=((0.3016807020283281, "left open"), (0.7850142235821842, "left open"), (1.178736161714749, "left open"),
                (1.41752252299837, "right open"), (1.64974638740134, "right open"), (1.835747166785115, "right open"),
                (1.989038206431418, "right open")),
-        results="siconos/siconos-tutorials @ b6c9bfd1, examples/mechanics/RockingBlock/"
-                "RockingBlockED_Lsodar_LZBimpact.ref",
+        results=BLOCK.format("RockingBlockED_Lsodar_LZBimpact.ref"),
         note="Published: LSODAR from impact to impact, with impulses in steps of 5e-5 N s. The mass and the inertia are"
              " those of a block of 1 m by 0.5 m, and the corners those of a block of 0.2 m by 0.1 m.",
+    ),
+    _case(
+        "Siconos RockingBlock, flat", BLOCK.format("RockingBlockED.cpp"), flat_block,
+        {"m": 1.0, "J": 0.05 / 12.0, "g": 9.81, "length": 0.2, "height": 0.1, "e": 0.9}, 2.0,
+        _BLOCK, lambda q, qd: (*q, *qd), (), exact_flat_block, by=("g", "e", "height"),
+        note="The repository has no results of this one.",
+    ),
+    _case(
+        "Siconos RockingBlock, on a corner", BLOCK.format("RockingBlockED_Lsodar_LZBimpact.cpp"), rocking_block,
+        {"m": 1.0, "J": 1.25 / 12.0, "g": 9.81, "length": 1.0, "height": 0.5, "e": 0.8}, 1.2,
+        _BLOCK, lambda q, qd: (*q, *qd), (), exact_block_on_a_corner, by=("m", "g", "e"),
+        modes=((0.5874779745738901, "right open"),), results=BLOCK.format("resultED_LZBmodel_LsodarOSI.ref"),
+        note="Published: the first impact, and afterwards another law, by which the impact lifts the resting corner.",
     ),
 )  # fmt: skip

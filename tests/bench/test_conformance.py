@@ -19,10 +19,11 @@ COARSE = {
 LATER = {"Translational.Friction, stop2": 5e-9}
 
 
-@pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.published])
+@pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.published or case.modes])
 def test_a_reference_explains_the_published_figures(name):
     case = CASES[name]
-    reference, published = case.exact(), np.array([np.nan if x is None else x for x in case.published])
+    reference = case.exact()
+    published = np.array([np.nan if x is None else x for x in case.published or [None] * len(case.outputs)])
     values = np.where(np.isnan(published), np.nan, reference.values)
     np.testing.assert_allclose(values, published, rtol=COARSE.get(name, 5e-4), atol=COARSE.get(name, 6e-5))
     # A mode change of the files is the first sample in the new mode. At rest, gear and bearing hold together.
