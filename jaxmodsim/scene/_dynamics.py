@@ -210,7 +210,7 @@ class Dynamics(NamedTuple):
             atol.append(jnp.where(gaps > 0, 0.0, tolerances[1] + rounding))
             roots.append(jnp.where(gaps > 0, 0.0, rounding))
         if sides.size:
-            loads, of_loads = self.guide_loads
+            loads, of_loads = self.guide_loads(rest)
             values = jnp.concatenate([self.scene.side_values(*state), loads])
             # Kinks have the rounding of their numbers as a hysteresis, as they may stay near zero.
             none = jnp.zeros(len(self.scene.switches), sides.dtype)
@@ -318,9 +318,12 @@ class Dynamics(NamedTuple):
         """Modes of the friction elements, of the contacts, and of switches and kinks."""
         return self.scene.split_modes(self.mode)
 
-    @property
-    def guide_loads(self) -> tuple[Float[Array, " guides"], Float[Array, " guides"]]:
-        """Normal forces of `Scene.guides` [N], negative if they pull, and their rounding errors."""
+    def guide_loads(self, rest: Scalar) -> tuple[Float[Array, " guides"], Float[Array, " guides"]]:
+        """Normal forces of `Scene.guides` [N], negative if they pull, and their errors.
+
+        These are of rounding, and at least those by an acceleration of `rest`: where all forces are errors of stick, so
+        is the sign of a load.
+        """
         none = jnp.zeros(0, self.t.dtype)
         if not self.scene.guides:
             return none, none
@@ -330,7 +333,8 @@ class Dynamics(NamedTuple):
         at = np.array([self.scene.loaded.index(name) for name in self.scene.guides])
         unit = _ROUNDING * float(jnp.finfo(self.t.dtype).eps)
         cancelled = jax.lax.stop_gradient(jnp.abs(loads.normal_coupling) * jnp.abs(self.friction.force)[None, :])
-        return self.friction.normal[at], (loads.rounding + unit * jnp.sum(cancelled, axis=1))[at]
+        error = loads.rounding + unit * jnp.sum(cancelled, axis=1) + rest * loads.mass
+        return self.friction.normal[at], error[at]
 
     @property
     def contact_forces(self) -> Float[Array, " n"]:
@@ -449,8 +453,8 @@ def forward_dynamics(t: Scalar, y: State, scene: Scene, mode: Modes = None) -> D
         if scene.loaded:
             size = jnp.sum(jnp.abs(linearized.rows * free[None, :, 0]), axis=1) + jnp.abs(linearized.bias)
             size, scale = jax.lax.stop_gradient((size, jnp.diagonal(linearized.matrix)))
-            size = unit * size / jnp.where(scale > 0, scale, 1.0)
-            loads = _loads(scene, t, y, directions, linearized.rows, multipliers, yields, of_guides, size)
+            mass = 1.0 / jnp.where(scale > 0, scale, 1.0)
+            loads = _loads(scene, t, y, directions, linearized.rows, multipliers, yields, of_guides, mass, unit * size)
     modes = jnp.zeros(0, q.dtype) if mode is None else scene.split_modes(mode)[0]
     elements = assemble_friction(friction, along, minv_jt, rounding, loads, t, q, qd, params, qdd, modes)
     solved = solve_friction_forces(elements, modes)
@@ -477,12 +481,14 @@ def _loads(
     multipliers: Float[Array, " m"],
     yields: Float[Array, "m n"],
     sides: dict[str, Scalar],
+    mass: Float[Array, " m"],
     rounding: Float[Array, " m"],
 ) -> Loads:
     """Normal forces of the constraints that load friction, and their change by the friction forces.
 
     `directions`: the rows of each element. `constraints`: those of the constraints. `yields`: change of the multipliers
-    with unit forces along the rows. `sides`: signs of the loads of guides. `rounding`: errors of the multipliers.
+    with unit forces along the rows. `sides`: signs of the loads of guides. `mass`: multipliers per acceleration along
+    the constraints. `rounding`: errors of these accelerations.
     """
     names, friction = scene.loaded, (*scene.event_driven.values(), *scene.reaction_loaded.values())
     rows = [(x, row) for x, each in zip(friction, directions, strict=True) for row in each]
@@ -501,13 +507,15 @@ def _loads(
             torque = torque / (jnp.unstack(size)[k] * jnp.where(square > 0, square, 1.0))
             on = jnp.where(loads & (np.arange(len(rows)) == i)[:, None], jnp.abs(torque), on)
             drives[i] = jnp.where(torque < 0, -1.0, 1.0)
+    mass = jax.lax.stop_gradient(jnp.abs(size)) * mass[at]
     return Loads(
         on,
         size * multipliers[at],
         size[:, None] * yields[at],
         jnp.asarray([0.0 if isinstance(chosen[name], Contact) else -1.0 for name in names], y.q.dtype),
         jnp.stack([sides.get(name, jnp.zeros_like(t)) for name in names]),
-        jax.lax.stop_gradient(jnp.abs(size)) * rounding[at],
+        mass,
+        mass * rounding[at],
         tuple(drives),
     )
 

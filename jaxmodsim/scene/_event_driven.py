@@ -75,6 +75,7 @@ class Loads(NamedTuple):
     - `normal_coupling`: C, by which unit forces of the rows reduce the normal forces, shape `[k, n]`.
     - `pulls`: -1 for constraints whose friction is as large when they pull, 0 for those that can only push.
     - `side`: sign of a normal force that counts in its place, so that friction is smooth where it changes; 0 for none.
+    - `mass`: normal force per acceleration along the constraint [kg].
     - `rounding`: rounding errors of the normal forces [N].
     - `drives`: for each row of a gear the sign of its load that drives positive slip: the constraint then opposes slip
       of the motor, on whose side the friction acts. None for other rows.
@@ -85,6 +86,7 @@ class Loads(NamedTuple):
     normal_coupling: Float[Array, "k n"]
     pulls: Float[Array, " k"]
     side: Float[Array, " k"]
+    mass: Float[Array, " k"]
     rounding: Float[Array, " k"]
     drives: tuple[Scalar | None, ...] = ()
 

@@ -38,7 +38,7 @@ def start(
         sides = _start_sides(t, y, scene, jnp.concatenate([jnp.zeros_like(slips), closed, above]))
     if scene.event_driven:
         begun = _join(jnp.zeros_like(slips), closed, sides)
-        begin = lambda d: (*d.start_friction(rest), d.guide_loads[0])  # noqa: E731
+        begin = lambda d: (*d.start_friction(rest), d.guide_loads(rest)[0])  # noqa: E731
         y, slips, loads = from_dynamics(begin, t, y, scene, begun)
         # Those of stick, as `begun` says: where slip changes a sign, the guard is violated and changes it at once.
         sides = jnp.concatenate([sides, jnp.where(loads >= 0, 1.0, -jnp.ones_like(loads))])

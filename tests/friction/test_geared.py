@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 
 import jaxmodsim as jms
 from jaxmodsim import Bristle, Coulomb, Dahl, Geared, ServoGear, Stribeck, asymmetric, scaled_by
@@ -465,3 +466,32 @@ def test_a_jump_of_the_quadratic_terms_is_in_the_derivative() -> None:
     slopes, found = jax.jacfwd(lambda x: 2 * (speed(x),), has_aux=True)(x)  # in one program
     assert found == pytest.approx(float(exact(x)), abs=1e-9)
     np.testing.assert_allclose(slopes, jax.jacfwd(exact)(x), atol=1e-8)
+
+
+def test_a_rigid_gear_without_load_at_rest_takes_few_steps() -> None:
+    """Pad, spring, gear 2:1 and bearing: until the pad slips at 0.5 s, the load of the gear is an error of rounding.
+
+    Then the spring pulls with 2 s - 0.2 sin(10 s), s = t - 0.5, and the bearing holds half of 0.5 N, and friction of
+    the gear a quarter of that.
+    """
+
+    def lagrangian(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del t, p
+        return 0.5 * jnp.sum(qd**2) - 50.0 * (q[1] - q[0]) ** 2
+
+    def pull(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del q, qd, p
+        return jnp.stack([2.0 * t, 0.0, 0.0])
+
+    effects = (
+        jms.AppliedForce(pull),
+        jms.Friction(Coulomb(1.0), along=lambda q: q[0], name="pad"),
+        jms.Friction(Geared(Coulomb(0.0), 0.25, "mesh", 0.2), along=lambda q: q[1], name="gear"),
+        jms.Friction(Coulomb(0.5), along=lambda q: q[2], name="bearing"),
+    )
+    mesh = jms.Constraint(lambda t, q, p: q[1] - 2.0 * q[2], name="mesh")
+    run = jms.simulate(jms.Scene(lagrangian, effects=effects, constraints=(mesh,)), [0.0] * 3, [0.0] * 3, 0.8)
+    slips = {change.effect: change.t for change in run.mode_changes}
+    break_away = scipy.optimize.brentq(lambda s: 2.0 * s - 0.2 * np.sin(10.0 * s) - 0.3125, 0.1, 0.4)
+    np.testing.assert_allclose([slips["pad"], slips["bearing"]], [0.5, 0.5 + break_away], atol=1e-6)
+    assert run.stats["num_steps"] < 200

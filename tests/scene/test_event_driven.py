@@ -62,7 +62,7 @@ def test_stick_takes_the_acceleration_that_slip_leaves() -> None:
 def test_a_reaction_as_load_is_solved_with_the_friction_under_it(pulls: float, normal: float) -> None:
     """n = normal - 0.4 f with f = 0.5 |n|, or 0.5 max(n, 0) of a contact."""
     on, coupling, none = jnp.array([[1.0], [0.0]]), jnp.array([[0.4, 0.0]]), jnp.zeros(1)
-    loads = Loads(on, jnp.array([normal]), coupling, jnp.array([pulls]), side=none, rounding=none)
+    loads = Loads(on, jnp.array([normal]), coupling, jnp.array([pulls]), side=none, mass=none, rounding=none)
     forces = solve_friction_forces(scalars(loads=loads), jnp.array([1.0, 0.0]))
     load = normal / 1.2 if normal > 0 else -normal / 0.8 if pulls else 0.0
     np.testing.assert_allclose(forces.force, [0.5 * load, (1.0 - 0.5 * load) / 2.0], rtol=1e-13)
@@ -79,7 +79,7 @@ def test_a_gear_has_coefficients_by_the_direction_of_power(normal: float, direct
     returned = LawForces(*(first * (b - a) for a, b in zip(law, other, strict=True)))
     gears = LawForces(*(first * x for x in (0.3, -0.3, 0.4, 0.4))), returned
     on, coupling, none = jnp.array([[1.0], [0.0]]), jnp.array([[0.4, 0.0]]), jnp.zeros(1)
-    loads = Loads(on, jnp.array([normal]), coupling, jnp.array([-1.0]), side=none, rounding=none)
+    loads = Loads(on, jnp.array([normal]), coupling, jnp.array([-1.0]), side=none, mass=none, rounding=none)
     sides = {"positive_slip": 0.5, "negative_slip": -0.2, "upper": 0.5, "lower": 0.2}
     of_rows = {name: [x, np.sign(x)] for name, x in sides.items()}
     forces = solve_friction_forces(scalars(loads=loads, gears=gears, **of_rows), jnp.array([direction, 0.0]))

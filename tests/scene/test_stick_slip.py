@@ -471,3 +471,20 @@ def test_two_blocks_that_let_go_or_turn_together_have_the_derivatives_of_one_aft
             a = jnp.array([3.0, 3.0 + apart])
             expected = central_difference(lambda x, a=a, v0=v0: end(a.at[0].set(x), v0), 3.0, 1e-3)
             np.testing.assert_allclose(slopes(a, v0)[:, 0], expected, atol=1e-5)
+
+
+def test_a_limit_near_zero_under_a_load_with_a_kink_takes_few_steps() -> None:
+    """Nothing happens before the kink, where the guard is nearly zero; from there the mass moves as (t - 0.2)^3/3."""
+
+    @jax.jit
+    def run(limit: Any) -> Any:
+        ramp = jms.AppliedForce(lambda t, q, qd, p: 2.0 * jnp.maximum(t - 0.2, 0.0)[None])
+        scene = jms.Scene(lambda t, q, qd, p: 0.5 * qd[0] ** 2, effects=(ramp, jms.Friction(jms.Coulomb(limit))))
+        run = jms.simulate(scene, [0.0], [0.0], 1.2)
+        return run.q[-1, 0], run.events.t[0], run.stats["num_steps"]
+
+    for limit in (0.0, 1e-12):
+        q, break_away, steps = run(limit)
+        np.testing.assert_allclose(q, 1.0 / 3.0, rtol=1e-6)
+        np.testing.assert_allclose(break_away, 0.2, atol=1e-9)
+        assert steps < 200

@@ -174,18 +174,21 @@ def _ratio(allowed: Numbers, size: Numbers) -> Numbers:
 def first_root(scan: GuardScan, passed: Flags) -> Float[Array, ""]:
     """The earliest root in a step among the functions that `passed` marks; 1 if it marks none.
 
-    The estimates of the roots decide which function is the first; Newton's iteration refines its root.
+    The estimates of the roots decide which function is the first; Newton's iteration refines its root. A refined root
+    near the start counts only if the step resolves the function: one that is zero up to a kink has its root there, but
+    its cubic has one at the start.
     """
     rough = jnp.where(passed, scan.root, 1.0)
     first = jnp.min(rough)
     only = jnp.arange(rough.shape[0]) == jnp.argmin(rough)  # one, also where several are equal
-    c0, c1, c2, c3 = (jnp.max(jnp.where(only, c, -jnp.inf)) for c in scan.cubic)
+    c0, c1, c2, c3, factor = (jnp.max(jnp.where(only, c, -jnp.inf)) for c in (*scan.cubic, scan.landing_factor))
     root = first
     for _ in range(_REFINEMENTS):
         slope = c1 + root * (2.0 * c2 + root * 3.0 * c3)
         root = root - (c0 + root * (c1 + root * (c2 + root * c3))) / jnp.where(slope < 0, slope, -jnp.inf)
         root = jnp.clip(root, 0.0, 1.0)
-    return jnp.where((first > 0) & (first < 1), root, first)
+    trusted = (root > 0.5 * first) | (factor > jnp.where(c1 > 0, first, 1.0))
+    return jnp.where((first > 0) & (first < 1) & trusted, root, first)
 
 
 def instant(resolution: Array) -> Array:

@@ -387,8 +387,11 @@ class EventSolver(AbstractSolverWrapper):
         fired = here & landed
         order = jnp.where(seen.ahead < jnp.inf, seen.ahead, seen.root - 1.0)  # a guard in rounding may not fall
         first = jnp.arange(fired.shape[0]) == jnp.argmin(jnp.where(fired, order, jnp.inf))
-        ahead = jnp.where(missed, earliest, 1.0 + jnp.maximum(sight, 0.0))
         coming = jnp.argmin(jnp.where(missed, jnp.where(passed, seen.root, jnp.inf), seen.ahead))
+        # A root that this step does not resolve is reached by a last step that does.
+        factor = seen.landing_factor[coming]
+        earliest = earliest - jnp.where(factor < earliest, jnp.minimum(factor, 0.5 * earliest), 0.0)
+        ahead = jnp.where(missed, earliest, 1.0 + jnp.maximum(sight, 0.0))
         next_end = self._policy.next_end(ahead, missed, (landing(ahead)[coming], divisor))
         return Landing(fired, first, order, missed, landed, landed, next_end, jnp.sum(jnp.where(first, near, 0.0)))
 
