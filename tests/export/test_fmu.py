@@ -281,7 +281,7 @@ def test_derivatives_are_those_of_jax(name: str) -> None:
     modes = jnp.asarray(one.getInt32([at[f"{x}.mode"] for x in scene.mode_names]), float) if scene.mode_names else None
     if scene.guides:  # and their sides, which are no variables
         assert modes is not None
-        loads = forward_dynamics(jnp.zeros(()), y, scene, jnp.append(modes, 1.0)).guide_loads[0]
+        loads = forward_dynamics(jnp.zeros(()), y, scene, jnp.append(modes, 1.0)).guide_loads(jnp.zeros(()))[0]
         modes = jnp.append(modes, jnp.where(loads >= 0, 1.0, -1.0))
 
     def everything(t: Any, scene: jms.Scene, y: State) -> list[Any]:
