@@ -239,3 +239,26 @@ def test_a_slip_that_nearly_stays_ends_at_its_root() -> None:
     t, code = jax.jit(lambda cases: jax.lax.map(first, cases))(cases)
     assert not np.any(code)
     np.testing.assert_allclose(t, 1.0 - np.sqrt(cases[:, 1]), atol=1e-3)
+
+
+def test_friction_under_two_waves_ends_at_t1() -> None:
+    """The cubic of a step that is too long has roots that are none: by those, some of these runs ended as chatter."""
+    rng = np.random.default_rng(3)
+    numbers = rng.uniform((0.5, 0.0, 0.5, 1.0, -2.0, 0.3, -1.0), (3.0, 100.0, 4.0, 8.0, 2.0, 2.0, 1.0), (120, 7))
+
+    def lagrangian(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del t
+        return 0.5 * p["m"] * qd[0] ** 2 - 0.5 * p["k"] * q[0] ** 2
+
+    def drive(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del q, qd
+        return (p["a"] * jnp.sin(p["w"] * t) + p["b"] * jnp.sin(2.3 * p["w"] * t))[None]
+
+    def code(x: Any) -> Any:
+        m, k, a, w, b, Fc, v = x
+        params = {"m": m, "k": k, "a": a, "w": w, "b": b}
+        scene = jms.Scene(lagrangian, params, (jms.AppliedForce(drive), jms.Friction(jms.Coulomb(Fc))))
+        return jms.simulate(scene, 0.0 * v[None], v[None], F(5.0), throw=False).code
+
+    codes = jax.jit(lambda x: jax.lax.map(code, x))(jnp.asarray(numbers, F))
+    np.testing.assert_array_equal(codes, 0)
