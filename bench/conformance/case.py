@@ -38,10 +38,10 @@ class Case:
     """A case that others published.
 
     - `source`: repository, commit and path. `results`: the same for its published results.
-    - `numbers`: parameters by name; `make` builds scene and initial state from them.
+    - `make`: builds scene and initial state from `numbers`, the parameters by name.
     - `outputs`: names and units of the numbers that `observe(q, qd)` returns at `t1` [s].
-    - `reference`: outputs and events from the same numbers, by a method that knows nothing of `jaxmodsim`.
     - `published`: published outputs, None for those that are not. `modes`: published mode changes.
+    - `reference`: outputs and events from the same numbers by position, by a method that knows nothing of `jaxmodsim`.
     - `compared`: names of effects whose events are compared; all by default.
     - `by`: parameters of the derivative. `step`: of its central differences of the reference, relative to a number.
     - `note`: what differs from the published model, or why the case fails.
@@ -49,13 +49,13 @@ class Case:
 
     name: str
     source: str
-    numbers: Mapping[str, float]
     make: Callable[[Numbers], Setup]
+    numbers: Mapping[str, float]
     t1: float
     outputs: tuple[str, ...]
     observe: Callable[[Any, Any], Any]
+    published: tuple[float | None, ...]
     reference: Callable[..., Reference]
-    published: tuple[float | None, ...] = ()
     modes: tuple[Event, ...] = ()
     compared: tuple[str, ...] = ()
     by: tuple[str, ...] = ()
@@ -66,7 +66,7 @@ class Case:
 
     def exact(self, **changed: float) -> Reference:
         """The reference, with some numbers changed."""
-        return self.reference(**(dict(self.numbers) | changed))
+        return self.reference(*(dict(self.numbers) | changed).values())
 
     def exact_derivatives(self) -> np.ndarray:
         """Derivatives of the outputs by the numbers `by`, shape `[by, outputs]`: central differences of sixth order."""
@@ -116,6 +116,13 @@ def _need_success(run: jms.Trajectory) -> None:
     """Raise an error with the message of a run that ended early."""
     if not str(run.result).startswith("The run reached t1"):
         raise RuntimeError(str(run.result))
+
+
+def modelica_case(name: str, *given: Any, **more: Any) -> Case:
+    """A case of the Modelica Standard Library, `name` such as `Rotational.First`; text after a comma is ours."""
+    path = "Modelica/Mechanics/{}/Examples/{}".format(*name.partition(",")[0].split("."))
+    results = f"modelica/MAP-LIB_ReferenceResults @ d6a2b9b2, {path}/{path.rpartition('/')[2]}.csv"
+    return Case(name, f"modelica/ModelicaStandardLibrary @ bd753330a, {path}.mo", *given, results=results, **more)
 
 
 class Outcome(NamedTuple):

@@ -212,41 +212,36 @@ def exact_target_velocity() -> np.ndarray:
     return np.array([vx, vy])
 
 
-def _case(task, make, numbers, t1, outputs, observe, published, reference, **more) -> Case:
-    return Case(
-        f"diff_sim_grads {task.partition('_')[0]}", SOURCE.format(task), numbers, make, t1, outputs, observe,
-        lambda **n: reference(*n.values()), published, **more,
-    )  # fmt: skip
-
-
 CASES = (
-    _case(
-        "task1_bounce_once", bounce_once, {"y": 1.0, "vy": -2.0, "u": 0.0, "e": 1.0}, 1.0, ("height [m]",),
-        lambda q, qd: (q[1],), (), exact_bounce_once, by=("y", "vy", "u"),
+    Case(
+        "diff_sim_grads task1", SOURCE.format("task1_bounce_once"), bounce_once,
+        {"y": 1.0, "vy": -2.0, "u": 0.0, "e": 1.0}, 1.0, ("height [m]",), lambda q, qd: (q[1],), (), exact_bounce_once,
+        by=("y", "vy", "u"),
     ),
-    _case(
-        "task2_bounce_ground_wall", ground_and_wall, {"x": -0.5, "y": 1.0, "vx": 5.0, "vy": -5.0, "e": 0.92}, 0.6,
-        ("loss [m^2]",), lambda q, qd: (loss_of_place(q[0], q[1]),), (), exact_ground_and_wall,
-        by=("x", "y", "vx", "vy"),
+    Case(
+        "diff_sim_grads task2", SOURCE.format("task2_bounce_ground_wall"), ground_and_wall,
+        {"x": -0.5, "y": 1.0, "vx": 5.0, "vy": -5.0, "e": 0.92}, 0.6, ("loss [m^2]",),
+        lambda q, qd: (loss_of_place(q[0], q[1]),), (), exact_ground_and_wall, by=("x", "y", "vx", "vy"),
     ),
-    _case(
-        "task3_two_balls", two_balls, {"u": 3.0, "start": -2.0}, 1.0, ("place of ball 2 [m]",), lambda q, qd: (q[2],),
+    Case(
+        "diff_sim_grads task3", SOURCE.format("task3_two_balls"), two_balls,
+        {"u": 3.0, "start": -2.0}, 1.0, ("place of ball 2 [m]",), lambda q, qd: (q[2],),
         (), exact_two_balls, by=("u", "start"),
     ),
     *(
         Case(
             f"alpha_gradient ball_with_wall, {name}",
             "hjsuh94/alpha_gradient @ 5e2ef6f3, examples/ball_with_wall/ball_with_wall.py",
-            {"angle": angle, "v": 1.0, "g": 9.81, "d": 0.06}, ball_with_wall, 0.3, ("cost [m^2]",),
-            lambda q, qd: (-(q[0] ** 2),), lambda **n: exact_ball_with_wall(*n.values()), (published,),
+            ball_with_wall, {"angle": angle, "v": 1.0, "g": 9.81, "d": 0.06}, 0.3, ("cost [m^2]",),
+            lambda q, qd: (-(q[0] ** 2),), (published,), exact_ball_with_wall,
             by=("angle", "v", "d"), note="Published: the closed form. The wall has a thickness of 1 mm here.",
         )
         for name, angle, published in (("over", 0.75, WALL_COSTS[0]), ("against", 0.5, WALL_COSTS[1]))
     ),
     Case(
         "nimblephysics bouncing block", "keenon/nimblephysics @ c405b056, unittests/comprehensive/test_Gradients.cpp",
-        {"y": 1e-5, "v": -1.0, "e": 0.5}, bouncing_block, 1e-3, ("y [m]",), lambda q, qd: (q[1],),
-        lambda **n: exact_bouncing_block(*n.values()), by=("y", "v", "e"),
+        bouncing_block, {"y": 1e-5, "v": -1.0, "e": 0.5}, 1e-3, ("y [m]",), lambda q, qd: (q[1],),
+        (), exact_bouncing_block, by=("y", "v", "e"),
         note="Published: the derivative -0.5 by y, which the test accepts with an error of 0.005.",
     ),
 )  # fmt: skip

@@ -211,44 +211,38 @@ def exact_block_on_a_corner(m, J, g, length, height, e) -> Reference:
     return Reference(np.array([centre, angle, slopes(angle)[0] * rate, rate]), path.events)
 
 
-def _case(name, source, make, numbers, t1, outputs, observe, published, reference, **more) -> Case:
-    return Case(
-        name, source, numbers, make, t1, outputs, observe, lambda **n: reference(*n.values()), published, **more
-    )
-
-
 def _end(q, qd):
     return q[0], qd[0]
 
 
 CASES = (
-    _case(
+    Case(
         "EXUDYN lugreFrictionTest", "jgerstmayr/EXUDYN @ e44aca1b, main/pythonDev/Examples/lugreFrictionTest.py",
         pulled_lugre, {"m": 1.0, "k": 2.0, "sigma2": 0.4, "Fc": 1.0, "Fs": 1.5}, 25.0, ("x [m]", "v [m/s]"), _end,
         (1.908839199226505, 9.424154590959904e-06), exact_pulled_lugre, by=("k", "Fc", "Fs"),
         options={"atol": 1e-15, "rtol": 1e-11},
         note="Published: DOPRI5 with steps of 50 us. Reference: Radau of SciPy, whose own error is about 1e-10.",
     ),
-    _case(
+    Case(
         "nosnoc two_balls_cls", "nosnoc/nosnoc @ 0abef401, benchmarks/two_balls_cls/two_balls_spring_matlab.m",
         two_balls, {"k": 1e4, "g": 9.81, "e": 0.8}, 1.0, ("q1 [m]", "q2 [m]", "v1 [m/s]", "v2 [m/s]"),
         lambda q, qd: (*q, *qd), (), exact_two_balls, by=("e", "k", "g"),
         note="The repository compares with ode15s and has no numbers.",
     ),
-    _case(
+    Case(
         "nosnoc periodic_slip_stick_codim1",
         "nosnoc/nosnoc @ 0abef401, examples/periodic_slip_stick/periodic_slip_stick_codim1.m",
         slip_stick, {"m": 1.0, "k": 1.0, "Fs": 1.0}, 40.0, ("x1 [m]", "x2 [m/s]"), _end, (), exact_slip_stick,
         by=("m", "k", "Fs"), note="The repository has figures, and no numbers.",
     ),
-    _case(
+    Case(
         "Chrono SlidingGravityTest",
         "projectchrono/chrono @ 7689fbc0, src/tests/unit_tests/smc_contact/sequential/utest_SMC_sliding_gravity.cpp",
         sliding_box, {"m": 1.0, "g": 9.81, "mu": 0.5, "v": 5.0}, 2.0, ("travel [m]", "v [m/s]"), _end,
         (25.0 / 9.81, None), exact_sliding_box, by=("mu", "v", "g"), compared=("box",),
         note="Published: the closed form. The test accepts an error of 0.5 %, with contacts as springs and dampers.",
     ),
-    _case(
+    Case(
         "Siconos ImpactingStick",
         "siconos/siconos-tutorials @ b6c9bfd1, examples/mechanics/ImpactingStick/ImpactingStick.cpp",
         impacting_stick, {"m": 1.0, "length": 1.0, "g": 10.0, "e": 1.0, "mu": 0.01}, 0.2,
@@ -258,7 +252,7 @@ CASES = (
         results="siconos/siconos-tutorials @ b6c9bfd1, examples/mechanics/ImpactingStick/ImpactingStick.ref",
         note="Published: Moreau-Jean time-stepping of first order with steps of 0.1 ms.",
     ),
-    _case(
+    Case(
         "Siconos RockingBlock",
         BLOCK.format("RockingBlockED_Lsodar_LZBimpact.cpp"),
         rocking_block, {"m": 1.0, "J": 1.25 / 12.0, "g": 9.81, "length": 0.2, "height": 0.1, "e": 0.8}, 2.0,
@@ -272,13 +266,13 @@ CASES = (
         note="Published: LSODAR from impact to impact, with impulses in steps of 5e-5 N s. The mass and the inertia are"
              " those of a block of 1 m by 0.5 m, and the corners those of a block of 0.2 m by 0.1 m.",
     ),
-    _case(
+    Case(
         "Siconos RockingBlock, flat", BLOCK.format("RockingBlockED.cpp"), flat_block,
         {"m": 1.0, "J": 0.05 / 12.0, "g": 9.81, "length": 0.2, "height": 0.1, "e": 0.9}, 2.0,
         _BLOCK, lambda q, qd: (*q, *qd), (), exact_flat_block, by=("g", "e", "height"),
         note="The repository has no results of this one.",
     ),
-    _case(
+    Case(
         "Siconos RockingBlock, on a corner", BLOCK.format("RockingBlockED_Lsodar_LZBimpact.cpp"), rocking_block,
         {"m": 1.0, "J": 1.25 / 12.0, "g": 9.81, "length": 1.0, "height": 0.5, "e": 0.8}, 1.2,
         _BLOCK, lambda q, qd: (*q, *qd), (), exact_block_on_a_corner, by=("m", "g", "e"),

@@ -10,6 +10,7 @@ from bench.conformance.motion import Path, linear
 SOURCE = "siconos/siconos-tutorials @ b6c9bfd1, examples/control/RelayOscillator/{}"
 # Time of the comparison with sliding [s]. The attractor is aperiodic: errors of the published steps grow later.
 END = 5.0
+STATE = ("x1", "x2", "x3")
 
 
 def unit_masses(t, q, qd, p):
@@ -86,24 +87,17 @@ def exact_sliding_relay(xsi, omega, lam, k, x2) -> Reference:
     return Reference(path.y, path.events)
 
 
-def _case(name, file, make, numbers, t1, observe, published, reference, **more) -> Case:
-    return Case(
-        f"Siconos {name}", SOURCE.format(file), numbers, make, t1, ("x1", "x2", "x3"), observe,
-        lambda **n: reference(*n.values()), published, **more,
-    )  # fmt: skip
-
-
 CASES = (
-    _case(
-        "RelayOscillator", "RelayOscillator.py", relay,
+    Case(
+        "Siconos RelayOscillator", SOURCE.format("RelayOscillator.py"), relay,
         {"c": 3.0, "d": 2.0, "k": 1.0, "x2": 3.0 * np.sqrt(2.0) / (2.0 * np.pi)}, 100.0,
-        lambda q, qd: (q[1], q[0], qd[0]), (), exact_relay, by=("c", "d", "k"),
+        STATE, lambda q, qd: (q[1], q[0], qd[0]), (), exact_relay, by=("c", "d", "k"),
         options={"max_events": 64}, note="The repository has figures, and no numbers.",
     ),
-    _case(
-        "RelayOscillatorWithSliding", "RelayOscillatorWithSliding.cpp", sliding_relay,
+    Case(
+        "Siconos RelayOscillatorWithSliding", SOURCE.format("RelayOscillatorWithSliding.cpp"), sliding_relay,
         {"xsi": -0.07, "omega": 10.0, "lam": 0.05, "k": 1.0, "x2": 0.5}, END,
-        lambda q, qd: (qd[0], qd[1] - 2.0 * qd[0], qd[2] + qd[0]),
+        STATE, lambda q, qd: (qd[0], qd[1] - 2.0 * qd[0], qd[2] + qd[0]),
         (-0.03462634971259529, -0.6124208145131526, -0.1915135002989594), exact_sliding_relay,
         by=("xsi", "omega", "lam"), results=SOURCE.format("RelayOscillatorWithSliding.ref"),
         note="Published: Euler-Moreau time-stepping with steps of 10 ms; the row at 5 s.",

@@ -10,10 +10,7 @@ import numpy as np
 
 import jaxmodsim as jms
 from bench.conformance import references
-from bench.conformance.case import Case, Numbers, Setup
-
-SOURCE = "modelica/ModelicaStandardLibrary @ bd753330a, Modelica/Mechanics/Rotational/Examples/{}.mo"
-RESULTS = "modelica/MAP-LIB_ReferenceResults @ d6a2b9b2, Modelica/Mechanics/Rotational/Examples/{0}/{0}.csv"
+from bench.conformance.case import Numbers, Setup, modelica_case
 
 
 def inertias(t, q, qd, p):
@@ -187,18 +184,6 @@ def simple_gear_shift(p: Numbers) -> Setup:
     return Setup(scene, np.zeros(2), np.zeros(2))
 
 
-def _case(
-    name: str, make, numbers: dict[str, float], t1: float, outputs, observe, published, reference, **more
-) -> Case:
-    def exact(**numbers: float):
-        return reference(*numbers.values())
-
-    return Case(
-        f"Rotational.{name}", SOURCE.format(name), numbers, make, t1, outputs, observe, exact, published,
-        results=RESULTS.format(name), **more,
-    )  # fmt: skip
-
-
 _ONE_WAY = ("inertiaIn.phi [rad]", "inertiaIn.w [rad/s]", "phi_rel [rad]", "w_rel [rad/s]")
 _INERTIA_2 = ("Inertia2.phi [rad]", "Inertia2.w [rad/s]")
 
@@ -212,8 +197,8 @@ def _second(q, qd):
 
 
 CASES = (
-    _case(
-        "CoupledClutches", coupled_clutches,
+    modelica_case(
+        "Rotational.CoupledClutches", coupled_clutches,
         {"J1": 1.0, "J2": 1.0, "J3": 1.0, "J4": 1.0, "capacity": 20.0, "mu": 0.5, "peak": 1.1, "torque": 10.0}, 1.5,
         ("J1.phi [rad]", "J1.w [rad/s]", "clutch1.phi_rel [rad]", "clutch2.phi_rel [rad]", "clutch3.phi_rel [rad]",
          "clutch1.w_rel [rad/s]"),
@@ -225,8 +210,8 @@ CASES = (
                (0.906849137544, "clutch1 stick"), (1.00029586011, "clutch1 backward"),
                (1.14396963043, "clutch3 stick")),
     ),
-    _case(
-        "Friction", friction,
+    modelica_case(
+        "Rotational.Friction", friction,
         {"J1": 1.0, "J2": 0.05, "J3": 1.0, "capacity": 160.0, "brake": 1600.0, "c": 160.0, "d": 1.0, "torque": 200.0},
         3.0,
         ("clutch.phi_rel [rad]", "inertia3.phi [rad]", "inertia3.w [rad/s]", "spring.phi_rel [rad]",
@@ -238,29 +223,31 @@ CASES = (
                (0.109289495222, "clutch stick"), (0.534248645375, "clutch backward"), (0.640613805353, "brake stick"),
                (1.66363978373, "clutch stick")),
     ),
-    _case(
-        "OneWayClutch", one_way_clutch, {"J1": 1.0, "J2": 1.0, "capacity": 3.0, "mu": 0.5, "torque": 10.0}, 2.0,
+    modelica_case(
+        "Rotational.OneWayClutch", one_way_clutch,
+        {"J1": 1.0, "J2": 1.0, "capacity": 3.0, "mu": 0.5, "torque": 10.0}, 2.0,
         _ONE_WAY, _relative,
         (-0.21233087268389922, -0.24997891423672405, 0.48573261789939198, -5.1443863131176207e-16),
         references.one_way_clutch, by=("capacity", "mu", "J2"),
         note="Up to 100 N m hold against backward slip, where Modelica has no limit.",
     ),
-    _case(
-        "OneWayClutchDisengaged", one_way_clutch_disengaged, {"J1": 1.0, "J2": 1.0, "load": 0.3, "torque": 10.0}, 2.0,
+    modelica_case(
+        "Rotational.OneWayClutchDisengaged", one_way_clutch_disengaged,
+        {"J1": 1.0, "J2": 1.0, "load": 0.3, "torque": 10.0}, 2.0,
         _ONE_WAY, _relative,
         (-0.31287750498835681, -0.97145839861444794, 1.2173496429705832, 1.4429789225677909),
         references.one_way_clutch_disengaged, by=("load", "J1", "J2"),
         note="As before.",
     ),
-    _case(
-        "LossyGearDemo1", lossy_gear, {"J1": 1.0, "J2": 1.5, "eta": 0.5, "drive": 10.0, "load": 10.0}, 0.5,
+    modelica_case(
+        "Rotational.LossyGearDemo1", lossy_gear, {"J1": 1.0, "J2": 1.5, "eta": 0.5, "drive": 10.0, "load": 10.0}, 0.5,
         _INERTIA_2, _second, (1.6621687167841887e-05, -0.016261924038578124),
         references.lossy_gear_demo1, by=("eta", "J1", "J2"),
         modes=((0.0804771289481, "gear stick"), (0.199519900848, "gear forward"), (0.371342745024, "gear stick"),
                (0.464539461637, "gear backward")),
     ),
-    _case(
-        "LossyGearDemo2", lossy_gear_demo2,
+    modelica_case(
+        "Rotational.LossyGearDemo2", lossy_gear_demo2,
         {"J1": 1.0, "J2": 1.5, "eta": 0.5, "drive": 10.0, "load": 10.0, "bearing": 0.5}, 0.5,
         _INERTIA_2, _second, (-0.00058918332306942534, -0.0096242780930112012),
         references.lossy_gear_demo2, by=("eta", "bearing", "J1"),
@@ -268,29 +255,29 @@ CASES = (
                (0.456242660485, "gear backward"), (0.472738310501, "bearing backward")),
         note="At rest gear and bearing hold together, and their shares are not unique.",
     ),
-    _case(
-        "LossyGearDemo3", lossy_gear_demo3, {"J1": 1e-3, "J2": 1e-3, "bearing": 0.5}, 1.0,
+    modelica_case(
+        "Rotational.LossyGearDemo3", lossy_gear_demo3, {"J1": 1e-3, "J2": 1e-3, "bearing": 0.5}, 1.0,
         _INERTIA_2, _second, (0.099999999016922012, -1.0000009709187907e-09),
         references.lossy_gear_demo3, by=("bearing",), modes=((0.020000000002, "gear stick"),),
         note="As before. By one inertia alone the torque between the teeth has a kink at zero: no derivative.",
     ),
-    _case(
-        "Backlash", backlash, {"J": 5.0, "c": 20e3, "d": 50.0, "b": 0.7853981633974483}, 1.0,
+    modelica_case(
+        "Rotational.Backlash", backlash, {"J": 5.0, "c": 20e3, "d": 50.0, "b": 0.7853981633974483}, 1.0,
         ("elastoBacklash.phi_rel [rad]", "elastoBacklash.w_rel [rad/s]", "springDamper.phi_rel [rad]",
          "springDamper.w_rel [rad/s]"),
         lambda q, qd: (q[0], qd[0], q[1], qd[1]),
         (-0.15557036723690312, -7.0229304031262032, 0.010518034816392985, -0.14370331391695884),
         references.backlash, by=("c", "d", "b"),
     ),
-    _case(
-        "EddyCurrentBrake", eddy_current_brake,
+    modelica_case(
+        "Rotational.EddyCurrentBrake", eddy_current_brake,
         {"J": 1.0, "torque": 100.0, "speed": 10.0, "capacity": 1.0, "coefficient": 3.92e-3}, 1.0,
         ("inertia.phi [rad]", "heatCapacitor.T [K]"),
         lambda q, qd: (q[0], 293.15 + 0.5 * (400.0 - qd[0] ** 2)),
         (2.5622780615885228, 493.14984771874254), references.eddy_current_brake, by=("torque", "coefficient"),
     ),
-    _case(
-        "SimpleGearShift", simple_gear_shift,
+    modelica_case(
+        "Rotational.SimpleGearShift", simple_gear_shift,
         {"engine": 1.0, "load": 10.0, "ratio": 1.5, "capacity": 100.0, "torque": 20.0, "drag": 20.0}, 5.0,
         ("clutch.phi_rel [rad]", "engine.phi [rad]", "engine.w [rad/s]", "load.phi [rad]", "load.w [rad/s]"),
         lambda q, qd: (q[1] - q[0], q[0], qd[0], (q[0] + 1.5 * q[1]) / 2.5, (qd[0] + 1.5 * qd[1]) / 2.5),

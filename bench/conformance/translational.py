@@ -5,12 +5,9 @@ import numpy as np
 
 import jaxmodsim as jms
 from bench.conformance import references_translational as references
-from bench.conformance.case import Case, Numbers, Setup
+from bench.conformance.case import Numbers, Setup, modelica_case
 from bench.conformance.references import eddy_current_brake as exact_eddy_current_brake
 from bench.conformance.rotational import eddy_current_brake, gap_force
-
-SOURCE = "modelica/ModelicaStandardLibrary @ bd753330a, Modelica/Mechanics/Translational/Examples/{}.mo"
-RESULTS = "modelica/MAP-LIB_ReferenceResults @ d6a2b9b2, Modelica/Mechanics/Translational/Examples/{0}/{0}.csv"
 
 
 def masses(t, q, qd, p):
@@ -121,38 +118,28 @@ def heat_losses(p: Numbers) -> Setup:
     return Setup(jms.Scene(lagrangian, params, effects, constraints=stops), np.array([0.0, 0.1, 0.2, 0.3]), np.zeros(4))
 
 
-def _case(
-    name: str, make, numbers: dict[str, float], t1: float, outputs, observe, published, reference, **more
-) -> Case:
-    def exact(**numbers: float):
-        return reference(*numbers.values())
-
-    example = name.partition(", ")[0]
-    return Case(
-        f"Translational.{name}", SOURCE.format(example), numbers, make, t1, outputs, observe, exact, published,
-        results=RESULTS.format(example), **more,
-    )  # fmt: skip
-
-
 def _end(q, qd):
     return q[0], qd[0]
 
 
 CASES = (
-    _case(
-        "Brake", brake, {"m": 1.0, "capacity": 1.0, "mu": 0.5}, 2.0, ("mass1.s [m]", "mass1.v [m/s]"), _end,
+    modelica_case(
+        "Translational.Brake", brake,
+        {"m": 1.0, "capacity": 1.0, "mu": 0.5}, 2.0, ("mass1.s [m]", "mass1.v [m/s]"), _end,
         (0.59999999999301157, -1.1102230246251565e-16), references.brake, by=("capacity", "mu", "m"),
         modes=((1.1, "brake stick"),),
     ),
-    _case(
-        "Friction, stop1", friction, {"m": 1.0, "Fv": 1.0, "Fc": 5.0, "Fs": 10.0, "fexp": 2.0, "force": 25.0}, 5.0,
+    modelica_case(
+        "Translational.Friction, stop1", friction,
+        {"m": 1.0, "Fv": 1.0, "Fc": 5.0, "Fs": 10.0, "fexp": 2.0, "force": 25.0}, 5.0,
         ("stop1.s [m]", "stop1.v [m/s]"), _end, (1.7684628213204434, 6.8648585898125738),
         references.friction, by=("Fc", "Fs", "m"),
         modes=((0.410143135297, "stop1 forward"), (2.44268882456, "stop1 backward"), (4.44193990087, "stop1 forward")),
         note="The law is a subclass of `Stribeck` with Modelica's factor of 1.001 on the limit at rest.",
     ),
-    _case(
-        "Friction, stop2", friction_stop, {"m": 1.0, "Fv": 1.0, "Fc": 3.0, "Fs": 5.0, "fexp": 2.0, "c": 500.0}, 5.0,
+    modelica_case(
+        "Translational.Friction, stop2", friction_stop,
+        {"m": 1.0, "Fv": 1.0, "Fc": 3.0, "Fs": 5.0, "fexp": 2.0, "c": 500.0}, 5.0,
         ("stop2.s [m]", "stop2.v [m/s]"), _end, (-0.24751584799147497, -1.0136235951133056e-10),
         references.friction_stop, by=("Fc", "Fs", "m"), compared=("stop2",),
         modes=((0.0605969540595, "stop2 forward"), (0.201105639685, "stop2 backward"),
@@ -161,21 +148,21 @@ CASES = (
                (0.904204209026, "stop2 forward"), (1.04597406053, "stop2 stick")),
         note="Without the upper stop, which the mass does not reach.",
     ),
-    _case(
-        "ElastoGap", elasto_gap, {"m": 1.0, "c": 10.0, "d": 1.5}, 5.0,
+    modelica_case(
+        "Translational.ElastoGap", elasto_gap, {"m": 1.0, "c": 10.0, "d": 1.5}, 5.0,
         ("elastoGap1.v_rel [m/s]", "elastoGap2.s_rel [m]", "springDamper1.v_rel [m/s]", "springDamper2.s_rel [m]"),
         lambda q, qd: (qd[1], 2.0 - q[1], qd[0], 2.0 - q[0]),
         (0.53752970968098934, 2.7078870235576407, -0.0041932374877375706, 2.0003503785615258),
         references.elasto_gap, by=("c", "d", "m"),
     ),
-    _case(
-        "EddyCurrentBrake", eddy_current_brake,
+    modelica_case(
+        "Translational.EddyCurrentBrake", eddy_current_brake,
         {"J": 1.0, "torque": 100.0, "speed": 10.0, "capacity": 1.0, "coefficient": 3.92e-3}, 1.0,
         ("mass.s [m]", "heatCapacitor.T [K]"), lambda q, qd: (q[0], 293.15 + 0.5 * (400.0 - qd[0] ** 2)),
         (2.5622780615885228, 493.14984771874254), exact_eddy_current_brake, by=("torque", "coefficient"),
     ),
-    _case(
-        "PreLoad", preload, {"c": 1e6, "d": 250.0, "spring": 20e3, "drag": 2500.0, "force": 150.0}, 100.0,
+    modelica_case(
+        "Translational.PreLoad", preload, {"c": 1e6, "d": 250.0, "spring": 20e3, "drag": 2500.0, "force": 150.0}, 100.0,
         ("friction.v_rel [m/s]", "innerContactA.s_rel [m]", "innerContactB.s_rel [m]", "outerContactA.v_rel [m/s]",
          "outerContactB.s_rel [m]", "outerContactB.v_rel [m/s]"),
         lambda q, qd: (qd[2], 0.001 + q[0] - q[2], 0.00275 + q[2] - q[1], qd[0], 0.00325 - q[1], -qd[1]),
@@ -187,8 +174,8 @@ CASES = (
         note="The damping of a gap makes the equations stiff: Rodas5P. A differentiated run with error control of the"
         " derivative ends early, where the damping reaches its limit: `StoredSteps(probe=False)` does without.",
     ),
-    _case(
-        "HeatLosses", heat_losses,
+    modelica_case(
+        "Translational.HeatLosses", heat_losses,
         {"c": 100.0, "d": 10.0, "force": 20.0, "normal": 100.0, "support": 1.0, "peak": 2.0}, 2.0,
         ("damper.s_rel [m]", "damper.v_rel [m/s]", "massWithStopAndFriction.s [m]", "massWithStopAndFriction.v [m/s]",
          "springDamper.s_rel [m]", "springDamper.v_rel [m/s]", "springDamper1.s_rel [m]", "springDamper1.v_rel [m/s]"),

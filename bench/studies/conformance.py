@@ -13,9 +13,7 @@ from bench.conformance import gradients, impacts, peers, relays, rotational, tra
 from bench.conformance.case import Case, same_order
 from bench.record import Result, importable, timed
 
-CASES = {
-    case.name: case for each in (rotational, translational, impacts, relays, gradients) for case in each.CASES
-}  # fmt: skip
+CASES = {case.name: case for each in (rotational, translational, impacts, relays, gradients) for case in each.CASES}
 SMOKE = ("Translational.Brake", "diff_sim_grads task1")
 TASK1 = {"y": -1.0, "vy": -0.99559, "u": -0.0020698}  # the convex method of DiffCoSim, of nine methods the one in print
 

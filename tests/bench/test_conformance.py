@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from bench.conformance import gradients, impacts, peers, references_translational, relays, rotational, translational
+from bench.conformance import gradients, impacts, peers, references_translational
 from bench.conformance.case import same_order
+from bench.studies.conformance import CASES
 
-CASES = {case.name: case for each in (rotational, translational, impacts, relays, gradients) for case in each.CASES}
 # Published at a tolerance of 1e-6: 2e-5 of the values, and more where a stop or a temperature adds up.
 PUBLISHED = 1e-5
 QUICK = ("Translational.Brake", "Translational.ElastoGap", "Rotational.EddyCurrentBrake", "diff_sim_grads task1")
