@@ -13,7 +13,7 @@ forces are coefficients times n, and everything is solved together.
 """
 
 from collections.abc import Callable
-from itertools import accumulate, product
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -24,15 +24,19 @@ from jaxtyping import Array, Bool, Float
 
 from .._core.arrays import PerDof, Scalar, apply_matrix
 from .._core.cholesky import solve_semidefinite
-from .._core.lu import factor_lu
 from .._core.safe import safe_norm
+from ._loads import solve_loads
 from .forces._friction import Friction
 
 # Least weight of an element among redundant ones, relative to the largest.
 _LEAST_SHARE = 1e-2
+# Scalar rows hold a plane in a direction where less than this power of the rounding unit of its mobility is left.
+_HELD = 2.0 / 3.0
 # Rounding units in the load of a sticking element, of its limits.
 _LOAD_ROUNDING = 100.0
 
+# A load of a sticking element from this part of its limit on is at the limit.
+_AT_LIMIT = 1.0 - 1e-4
 # Rounding units by which the limits of stick are further out.
 _WIDER = 16.0
 
@@ -334,7 +338,7 @@ def solve_friction_forces(
     forces = jnp.where(sticks[:, None], _multipliers(elements, drive, sticks), slip_forces)
     fixed, push, pull = forces[:, 0], forces[:, 1 : k + 1], forces[:, -k:]
     gain = apply_matrix(coupling, forces)
-    signed, pushes, margin = _solve_loads(normal - gain[:, 0], gain[:, 1 : k + 1], pulls[None] * gain[:, -k:], side)
+    signed, pushes, margin = solve_loads(normal - gain[:, 0], gain[:, 1 : k + 1], pulls[None] * gain[:, -k:], side)
     load = jnp.where(pushes, 1.0, pulls) * signed
     force = fixed + apply_matrix(push if gears is None else jnp.where(pushes[None], push, pull), load)
     factor = jnp.where(loaded > 0, apply_matrix(on, load), 1.0)
@@ -350,63 +354,6 @@ def _slip_force(laws: LawForces, mode: Float[Array, " n"]) -> Float[Array, " n"]
     return jnp.where(mode > 0, laws.positive_slip, laws.negative_slip)
 
 
-def _solve_loads(
-    normal: Float[Array, " k"], push: Float[Array, "k k"], pull: Float[Array, "k k"], side: Float[Array, " k"]
-) -> tuple[Float[Array, " k"], Bool[Array, " k"], Scalar]:
-    """Solution n of `n + G n = normal`, with column k of G that of `push` for n_k >= 0, and that of `pull` otherwise.
-
-    A `side` that is not zero takes the place of the sign of n.
-
-    The margin is the smallest determinant of `I + G` over all G with columns between those of `push` and `pull`. The
-    determinant is linear in each column, so if it is positive for the columns themselves it is so in between, and then
-    the solution is unique (J. Rohn, Systems of linear interval equations, Linear Algebra and its Applications 126:39,
-    1989).
-
-    **Returns:**
-
-    n, which of them push, and the margin.
-    """
-    k = normal.shape[0]
-    if k == 1:
-        pushes = jnp.where(side == 0, normal, side) >= 0
-        return normal / (1.0 + jnp.where(pushes, push[0], pull[0])), pushes, 1.0 + jnp.minimum(push, pull)[0, 0]
-
-    # Cramer's rule for all choices of columns at once: entries are vectors of length 2^k.
-    takes = np.array(list(product((False, True), repeat=k))).T
-    rows = _rows(jnp.where(takes[None], pull[:, :, None], push[:, :, None]))
-    determinant = _determinant(rows)
-    right, violation = _constant(jnp.unstack(normal)), jnp.zeros(2**k, normal.dtype)
-    rows, divisor = _constant(rows), _constant(determinant)
-    for j in range(k):
-        replaced = [[*row[:j], right[i] + 0.0 * row[j], *row[j + 1 :]] for i, row in enumerate(rows)]
-        signed = _determinant(replaced) / jnp.where(divisor == 0, jnp.nan, divisor)
-        opposed = jnp.where(side[j] == 0, signed, side[j] * jnp.inf)
-        violation = violation + jnp.maximum(jnp.where(takes[j], opposed, -opposed), 0.0)
-    # The choice whose signs agree with its columns; two agree where a load is zero, and either is right.
-    best = jnp.min(jnp.where(jnp.isnan(violation), jnp.inf, violation))
-    pushes = ~jnp.any(takes & (violation <= best)[None, :], axis=1)
-    signed = jnp.stack(factor_lu(_rows(jnp.where(pushes[None], push, pull)), pivot=True)(list(jnp.unstack(normal))))
-    return signed, jnp.where(side == 0, signed >= 0, pushes), jnp.min(determinant)
-
-
-def _rows(gain: Float[Array, "k k *m"]) -> list[list[Array]]:
-    """Entries of `I + gain`, for one matrix or several."""
-    k = gain.shape[0]
-    matrix = gain + jnp.eye(k, dtype=gain.dtype).reshape(k, k, *(1,) * (gain.ndim - 2))
-    return [list(jnp.unstack(row)) for row in jnp.unstack(matrix)]
-
-
-def _determinant(rows: list[list[Array]]) -> Array:
-    """Determinants of matrices whose entries are vectors."""
-    if len(rows) == 1:
-        return rows[0][0]
-    total = jnp.zeros_like(rows[0][0])
-    for j, entry in enumerate(rows[0]):
-        minor = entry * _determinant([row[:j] + row[j + 1 :] for row in rows[1:]])
-        total = total - minor if j % 2 else total + minor
-    return total
-
-
 def _multipliers(
     elements: FrictionElements, drive: Float[Array, "n *k"], sticks: Bool[Array, " n"]
 ) -> Float[Array, "n *k"]:
@@ -418,11 +365,42 @@ def _multipliers(
     1 %, as `solve_semidefinite` is inaccurate for smaller weights: it reaches its limit early, and its slip is then an
     event at rest. The motion stays exact until the load reverses; the largest element then slips early by twice that
     limit, and a run may end in chatter. One element with the sum of the limits avoids this.
+
+    Planes carry only what scalar rows cannot. A plane that shares the load of a scalar row would reach its limit, and
+    take a direction of slip, before anything can move.
     """
     weight = 0.5 * (elements.laws.upper + elements.laws.lower)
     largest = jnp.max(weight)
     weight = jnp.maximum(weight / jnp.where(largest > 0, largest, 1.0), _LEAST_SHARE)
-    return solve_semidefinite(elements.delassus, drive, jnp.sqrt(jnp.where(largest > 0, weight, 1.0)), sticks)
+    weight = jnp.sqrt(jnp.where(largest > 0, weight, 1.0))
+    in_planes = np.zeros(drive.shape[0], bool)
+    for start, stop in elements.planes:
+        in_planes[start:stop] = True
+    if np.all(in_planes) or not np.any(in_planes):
+        return solve_semidefinite(elements.delassus, drive, weight, sticks)
+    order = np.argsort(in_planes, kind="stable")
+    columns = drive[order].reshape(order.size, -1)
+    scalars = int(np.sum(~in_planes))
+    force = _planes_last(elements.delassus[order][:, order], columns, weight[order], sticks[order], scalars)
+    return force[np.argsort(order)].reshape(drive.shape)
+
+
+def _planes_last(
+    matrix: Float[Array, "n n"],
+    drive: Float[Array, "n k"],
+    weight: Float[Array, " n"],
+    sticks: Bool[Array, " n"],
+    m: int,
+) -> Float[Array, "n k"]:
+    """Multipliers of m scalar rows and of the rows of planes after them, which carry what the scalar rows cannot."""
+    across, own = matrix[m:, :m], jnp.diagonal(matrix)[m:]
+    right = jnp.concatenate([drive[:m], across.T], axis=1)
+    of_scalars = solve_semidefinite(matrix[:m, :m], right, weight[:m], sticks[:m])
+    alone, taken = jnp.split(of_scalars, [drive.shape[1]], axis=1)
+    left = matrix[m:, m:] - apply_matrix(across, taken)
+    moves = jnp.diagonal(left) > float(jnp.finfo(own.dtype).eps) ** _HELD * own
+    planar = solve_semidefinite(left, drive[m:] - apply_matrix(across, alone), weight[m:], sticks[m:] & moves)
+    return jnp.concatenate([alone - apply_matrix(taken, planar), planar])
 
 
 def friction_guards(
@@ -552,6 +530,14 @@ def next_modes(
     before = solve_friction_forces(differentiable if elements.planes else elements, mode)
     # The direction is that of the nearer limit, which may be zero in one direction (a freewheel).
     load = elements.onset_mode((before.force - 0.5 * (before.upper - before.lower))[:n], rest)
+    alone = n == 1 or elements.planes == ((0, n),)
+    if elements.planes and not alone:
+        # Scalar rows that slip at rest, while a plane holds them, stick again if that relieves the plane.
+        at_rest = still | (elements.magnitude(elements.v[:n]) <= rest)
+        again = solve_friction_forces(elements, jnp.where(at_rest, 0.0, mode))
+        limit = jnp.where(again.force > 0, again.upper, again.lower)
+        relieved = jnp.any(at_limit) & ~jnp.any(at_limit & (elements.magnitude(again.force) >= _AT_LIMIT * limit)[:n])
+        still, at_limit = jnp.where(relieved, at_rest, still), at_limit & ~relieved
     mode = jnp.where(still, jnp.where(at_limit, load, jnp.zeros_like(mode)), mode)
     scale = 1e-6 * jnp.max(jnp.abs(elements.delassus) * jnp.maximum(before.upper, before.lower)[None, :], axis=1)[:n]
 
@@ -572,8 +558,15 @@ def next_modes(
         against = still & (in_direction < -scale) & ~jnp.any(worst) & (i < 3 * n)
         return jnp.where(worst, elements.onset_mode(force, rest), jnp.where(against, jnp.zeros_like(mode), mode))
 
-    alone = n == 1 or elements.planes == ((0, n),)
-    return improve(jnp.asarray(3 * n), mode) if alone else jax.lax.fori_loop(0, 4 * n, improve, mode)
+    if alone:
+        return improve(jnp.asarray(3 * n), mode)
+    mode = jax.lax.fori_loop(0, 4 * n, improve, mode)
+    if not elements.planes:
+        return mode
+    # Slip of a plane begins along its load beside the others, which slip or stick by now.
+    begins = elements.in_planes(jnp.zeros(n, bool), lambda part: still[part] & ~elements.sticks(mode)[part])
+    load = solve_friction_forces(differentiable, jnp.where(begins, 0.0, mode)).force[:n]
+    return jnp.where(begins, elements.onset_mode(load, rest), mode)
 
 
 def stop_slip(elements: FrictionElements, qd: PerDof, sticks: Bool[Array, " modes"]) -> PerDof:

@@ -26,7 +26,7 @@ from jaxmodsim import (
 )
 from jaxmodsim._core.cholesky import solve_semidefinite
 from jaxmodsim.scene import State, forward_dynamics, vector_field
-from jaxmodsim.scene._event_driven import _solve_loads
+from jaxmodsim.scene._loads import solve_loads
 
 ZERO = jnp.array(0.0)
 # As a whole, not operation by operation.
@@ -393,7 +393,7 @@ def all_loads(normal: Any, push: Any, pull: Any) -> list[Any]:
 def test_loads_that_depend_on_each_other(k: int) -> None:
     """Against all sign patterns: where the margin is positive there is one solution, and it is found."""
     rng = np.random.default_rng(k)
-    solve = jax.jit(_solve_loads)
+    solve = jax.jit(solve_loads)
     counts = {True: 0, False: 0}
     for _ in range(200):
         gain, normal = rng.normal(scale=0.6, size=(k, k)), rng.normal(size=k)

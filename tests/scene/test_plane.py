@@ -361,3 +361,28 @@ def test_a_bar_pushed_across_at_one_end_pivots_about_the_other() -> None:
     assert run.mode["left"][0] == 0
     lets_go = next(each for each in run.mode_changes if each.effect == "left" and each.before == "stick")
     np.testing.assert_allclose(lets_go.t, slips, rtol=1e-6)
+
+
+@pytest.mark.parametrize("load", [1.0, 1.9])
+def test_a_plane_beside_a_bearing_that_sticks_breaks_away_across_it(load: float) -> None:
+    """The bearing carries the load along it: by 1 s the plane carries its limit across, and y = (t - 1)^3/6."""
+    push = AppliedForce(lambda t, q, qd, p: jnp.stack([load + 0.0 * t, t]))
+    scene = Scene(lambda t, q, qd, p: 0.5 * jnp.sum(qd**2), effects=(push, *plane_and_bearing(1.0, 2.0)))
+    run = simulate(scene, [0.0] * 2, [0.0] * 2, 2.0, **TIGHT)
+    np.testing.assert_allclose(run.q[-1], [0.0, 1 / 6], atol=1e-9)
+    np.testing.assert_allclose(run.events.t[0], 1.0, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("pull", "limit"), [(1.7, 1.0), (2.5, 2.0)])
+def test_a_plane_and_a_bearing_hold_a_load_that_reverses(pull: float, limit: float) -> None:
+    """The load exceeds the limit of the bearing, and never that of both: the mass stays at rest."""
+    push = AppliedForce(lambda t, q, qd, p: jnp.stack([pull * jnp.sin(3 * t), 0.6 * jnp.sin(2 * t)]))
+    scene = Scene(lambda t, q, qd, p: 0.5 * jnp.sum(qd**2), effects=(push, *plane_and_bearing(1.0, limit)))
+    run = simulate(scene, [0.0] * 2, [0.0] * 2, 5.0)
+    np.testing.assert_allclose(run.q[-1], 0.0, atol=1e-12)
+
+
+def plane_and_bearing(of_plane: float, of_bearing: float) -> tuple[Friction, Friction]:
+    """Friction in the plane, and a bearing along x."""
+    plane = Friction(Coulomb(of_plane), along=lambda q: q, name="plane")
+    return plane, Friction(Coulomb(of_bearing), along=lambda q: q[0], name="bearing")
