@@ -21,14 +21,14 @@ FILES = sorted(ROOT.rglob("*.py"))
 # never in the wheel. Rooms are in the order of their imports: a room imports only rooms above it, imports for type
 # checkers included; what it takes from another room is among that room's public names. `_core` has none: all of it is
 # private to the package. The number is the budget of lines of a room: to raise it is a decision, whose commit says why.
-CORE = {"_core": 3403, "mechanics": 1598, "friction": 3020, "scene": 4078, "solvers": 4175, "simulation": 3240}
+CORE = {"_core": 3480, "mechanics": 1598, "friction": 3020, "scene": 4083, "solvers": 4179, "simulation": 3248}
 APPLICATIONS = {
     "metrics": 633,
     "analysis": 2136,
     "orbits": 3122,
     "identify": 9622,
     "sweeps": 2093,
-    "export": 1912,
+    "export": 1869,
     "control": 793,
     "problems": 2835,
     "plot": 1715,

@@ -8,9 +8,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
-from jaxmodsim import simulate
+from jaxmodsim import Contact, Coulomb, Friction, Scene, simulate
 from jaxmodsim.problems import named_problems
 
 from .hard.case import SceneTask
@@ -58,3 +59,21 @@ def kernels(function: Callable[[Any], Any], x: Any) -> dict[str, int]:
 def test_run_and_derivatives_are_one_kernel_each(name: str, read: Callable[[str], tuple[Any, Any]]) -> None:
     found = kernels(*read(name))
     assert (found != KERNELS) == (name in NOT_ONE_KERNEL), found
+
+
+def test_indices_in_a_lagrangian_and_two_contacts_with_friction() -> None:
+    """The derivative of `x[indices]` was a scatter, which no kernel holds, as was that of the loads of friction."""
+    bodies, ends = np.array([0, 2]), (-0.5, 0.5)
+
+    def lagrangian(t: Any, q: Any, qd: Any, p: Any) -> Any:
+        del t
+        return 0.5 * p["m"] * (jnp.sum(qd[bodies] ** 2) + qd[1] ** 2) - p["m"] * 9.81 * jnp.take(q, jnp.array([1]))[0]
+
+    contacts = [Contact(lambda t, q, p, x=x: q[1] + x * jnp.sin(q[2]), name=f"end {x}") for x in ends]
+    rubbing = [Friction(Coulomb(0.3), along=lambda q: q[0], normal_force=each.name) for each in contacts]
+
+    def last(m: Any) -> Any:
+        scene = Scene(lagrangian, {"m": m}, effects=rubbing, constraints=contacts)
+        return simulate(scene, np.array([0.0, 0.5, 0.1]), np.zeros(3), 0.5, throw=False).q[-1, 0]
+
+    assert kernels(last, jnp.asarray(1.0)) == KERNELS

@@ -3,6 +3,7 @@
 import abc
 import functools
 import itertools
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
 from typing import Any, TypeAlias
@@ -33,6 +34,9 @@ _ELEMENTWISE = {
 # Expensive functions that XLA treats as cheap, and recomputes wherever their result is used.
 _REPEATED = {"sin", "cos", "tan"}
 _SUMS = {"reduce_sum", "cumsum", "dot_general"}
+_INDEXED = {"gather", "scatter", "scatter-add", "dynamic_slice", "dynamic_update_slice"}
+# Platforms of the choice in `jnp.diagonal`: the first is that of kernels for TPUs, not of programs.
+_PROGRAMS = (("mosaic",), None)
 _CALLS = {"jit", "pjit", "closed_call", "core_call"}
 
 # Whether a function is being traced for scalars: the functions that it calls are then part of it.
@@ -63,7 +67,8 @@ def in_scalars(fn: Callable[..., PyTree], *args: PyTree, seed: Float[Array, "...
     **Arguments:**
 
     - `fn`: a function that JAX can trace. The result is that of the plain call outside `jax.jit` and similar
-      transformations, if all values are scalars, or if they have more than `MAX_SCALARS` entries in total.
+      transformations, and if all values are scalars. If they have more than `MAX_SCALARS` entries in total, `fn` is
+      evaluated in arrays, and only indices that are known become slices.
     - `args`: pytrees of arrays and numbers.
     - `seed`: numbers that are unknown while compiling. If the first is not finite, the result may not be finite.
 
@@ -76,11 +81,12 @@ def in_scalars(fn: Callable[..., PyTree], *args: PyTree, seed: Float[Array, "...
     closed, shapes = trace_in_arrays(fn, *args)
     leaves = [x if hasattr(x, "shape") else jnp.asarray(x) for x in jtu.tree_leaves(args)]
     sizes = [size for size in sizes_of(closed.jaxpr) if size <= MAX_ENTRIES]
-    if is_known(*leaves) or sum(sizes) > MAX_SCALARS:
+    if is_known(*leaves):
         return fn(*args)
     if max(sizes, default=0) > 1:
-        unit = opaque_one(jax.lax.stop_gradient(jnp.ravel(seed)[0]))
-        out = [_whole(x) for x in _Scalars(unit).run(closed.jaxpr, closed.consts, leaves)]
+        divided = sum(sizes) <= MAX_SCALARS
+        scalars = _Scalars(opaque_one(jax.lax.stop_gradient(jnp.ravel(seed)[0])) if divided else None)
+        out = [jnp.asarray(_whole(x)) for x in scalars.run(closed.jaxpr, closed.consts, leaves)]
     else:
         out = jaxpr_as_fun(closed)(*leaves)
     return jtu.tree_unflatten(jtu.tree_structure(shapes), out)
@@ -154,6 +160,8 @@ def _whole(x: Any) -> Any:
     """A value as one array."""
     if not is_apart(x):
         return x
+    if (known := known_array(x)) is not None:
+        return known
     # Row by row: XLA recognizes the entries of a stack, but not after a reshape.
     return jnp.asarray(x[()]) if x.shape == () else jnp.stack([_whole(x[i, ...]) for i in range(len(x))])
 
@@ -162,14 +170,27 @@ def is_apart(x: object) -> bool:
     return isinstance(x, np.ndarray) and x.dtype == object
 
 
+def known_array(x: Value) -> np.ndarray | None:
+    """A value as an array of numbers; None if any entry is not known."""
+    if not isinstance(x, np.ndarray | np.generic):
+        return None
+    if not is_apart(x):
+        return np.asarray(x)
+    if x.size == 0 or not all(map(is_constant, x.flat)):
+        return None
+    return np.asarray(x.tolist(), x.flat[0].dtype)
+
+
 class AbstractScalars(abc.ABC):
     """Evaluates a traced function entry by entry, and reuses equal terms.
 
-    Entries are NumPy scalars if they are known while tracing, otherwise results of `scalar`.
+    Entries are NumPy scalars if they are known while tracing, otherwise results of `scalar`. Without `divided` only
+    operations on known numbers, and moves to known places, are evaluated entry by entry.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, divided: bool = True) -> None:
         self.memory: dict[object, tuple[object, Any]] = {}
+        self.divided = divided
 
     @abc.abstractmethod
     def scalar(self, compute: Callable[..., Value], name: str, params: Params, operands: list[Value]) -> Value:
@@ -211,8 +232,17 @@ class AbstractScalars(abc.ABC):
         name, params = eqn.primitive.name, eqn.params
         if name in _CALLS:
             return self.run(params["jaxpr"].jaxpr, params["jaxpr"].consts, inputs)
+        if name == "platform_index" and params["platforms"] == _PROGRAMS:
+            return [np.asarray(1)]
+        if name == "cond" and (index := known_array(inputs[0])) is not None:
+            chosen = params["branches"][int(np.clip(int(index), 0, len(params["branches"]) - 1))]
+            return self.run(chosen.jaxpr, chosen.consts, inputs[1:])
         kinds = [x.aval for x in (*eqn.invars, *eqn.outvars)]
         if not all(self.divides(kind.size) for kind in kinds):
+            return self.whole(eqn, inputs)
+        if name in _INDEXED and (places := _places(eqn, inputs)) is not None:
+            return [self.at_places(name, places, *map(self.parts, inputs[:3]))]
+        if not self.divided and not (name in _KNOWN | _MOVES and all(known_array(x) is not None for x in inputs)):
             return self.whole(eqn, inputs)
         if name in _ELEMENTWISE:
             arrays, compute = np.broadcast_arrays(*map(self.parts, inputs)), eqn.primitive.bind
@@ -249,6 +279,16 @@ class AbstractScalars(abc.ABC):
     def add(self, a: Value, b: Value) -> Value:
         return self.apply(jax.lax.add, "add", {}, [a, b])
 
+    def at_places(self, name: str, places: np.ndarray, x: Parts, *others: Parts) -> Parts:
+        """The entries at these places of a flat array; or the array with updates there, the last of `others`."""
+        flat = x.reshape(-1).copy()
+        if name in ("gather", "dynamic_slice"):
+            return array_of(places.shape, lambda i: flat[places[i]])
+        updates = others[0] if name == "dynamic_update_slice" else others[1]
+        for place, update in zip(places.flat, updates.flat, strict=True):
+            flat[place] = self.add(flat[place], update) if name == "scatter-add" else update
+        return flat.reshape(x.shape)
+
     def reduce_sum(self, params: Params, x: Parts) -> Parts:
         axes = params["axes"]
         x = np.moveaxis(x, axes, range(len(axes)))
@@ -279,16 +319,16 @@ class AbstractScalars(abc.ABC):
 
 
 class _Scalars(AbstractScalars):
-    """Scalars of JAX."""
+    """Scalars of JAX. Without a `unit`, a one from `opaque_one`, arrays remain whole where that is possible."""
 
-    def __init__(self, unit: Array) -> None:
-        super().__init__()
+    def __init__(self, unit: Array | None) -> None:
+        super().__init__(divided=unit is not None)
         self.unit = unit
 
     def scalar(self, compute: Callable[..., Value], name: str, params: Params, operands: list[Value]) -> Value:
         """The operation of JAX."""
         out = compute(*operands, **params)
-        return fusion_barrier(out, self.unit) if name in _REPEATED else out
+        return out if self.unit is None or name not in _REPEATED else fusion_barrier(out, self.unit)
 
     def divides(self, size: int) -> bool:
         """Whether arrays of this size are small."""
@@ -326,6 +366,40 @@ def _shorten(name: str, operands: list[Value]) -> Value | None:
     if name == "sub" and is_constant(operands[1]) and operands[1] == 0:
         return operands[0]
     return None
+
+
+def _places(eqn: Any, inputs: list[Value]) -> np.ndarray | None:
+    """Places in the flat first operand that an operation reads or writes; None if not known, or out of range."""
+    name, params, shape = eqn.primitive.name, eqn.params, eqn.invars[0].aval.shape
+    numbers = np.arange(math.prod(shape)).reshape(shape)
+    if name.startswith("dynamic"):
+        window = params.get("slice_sizes", eqn.invars[1].aval.shape)
+        starts = [known_array(x) for x in inputs[-len(shape) :]]
+        if any(start is None for start in starts):
+            return None
+        within = zip(starts, shape, window, strict=True)
+        begins = [int(np.clip(int(np.asarray(start)), 0, size - width)) for start, size, width in within]
+        return numbers[tuple(slice(i, i + width) for i, width in zip(begins, window, strict=True))]
+    indices, dims = eqn.invars[1].aval, params["dimension_numbers"]
+    starts = known_array(inputs[1]) if indices.size else np.zeros(indices.shape, int)
+    applied = name == "scatter" and params["update_jaxpr"] is not None  # `x.at[indices].apply`
+    if starts is None or dims.operand_batching_dims or applied:
+        return None
+    if name == "gather":
+        single, moved, axes = dims.collapsed_slice_dims, dims.start_index_map, dims.offset_dims
+        window = params["slice_sizes"]
+    else:
+        single, moved, axes = dims.inserted_window_dims, dims.scatter_dims_to_operand_dims, dims.update_window_dims
+        widths = (eqn.invars[2].aval.shape[axis] for axis in axes)
+        window = tuple(1 if axis in single else next(widths) for axis in range(len(shape)))
+    batch = starts.shape[:-1]
+    begin = np.zeros((*batch, len(shape)), int)
+    begin[..., list(moved)] = starts
+    at = [begin[..., i].reshape(*batch, *[1] * len(shape)) + each for i, each in enumerate(np.indices(window))]
+    if any(np.any((each < 0) | (each >= size)) for each, size in zip(at, shape, strict=True)):
+        return None
+    places = numbers[tuple(at)].squeeze(tuple(len(batch) + axis for axis in single))
+    return np.moveaxis(places, range(len(batch), places.ndim), axes)
 
 
 def _pad(params: Params, x: Parts, filling: Parts) -> Parts:
@@ -378,7 +452,10 @@ _KNOWN: dict[str, Callable[..., ArrayLike]] = {
     "add_any": lambda _, a, b: a + b,
     "convert_element_type": lambda params, x: x.astype(params["new_dtype"]),
     "eq": lambda _, a, b: a == b,
+    "ge": lambda _, a, b: a >= b,
+    "lt": lambda _, a, b: a < b,
     "mul": lambda _, a, b: a * b,
     "neg": lambda _, x: -x,
+    "select_n": lambda _, chosen, *cases: cases[int(chosen)],
     "sub": lambda _, a, b: a - b,
 }

@@ -125,7 +125,8 @@ class Model(NamedTuple):
         self, t: Array, p: Scene, tol: Array, fired: Array, dense: Array, least: Array, y: State, m: Array
     ) -> tuple[State, Array]:
         """State and modes after the guards that fired; dense: whether impacts accumulate; least: a rebound's height."""
-        y, m, touching = switch(t, y, p, m, fired > 0, tol[0], dense > 0, False, least)
+        rate = vector_field(t, y, p, m) if p.contacts else None
+        y, m, touching = switch(t, y, p, m, fired > 0, tol[0], dense > 0, False, rate, least)
         return self.on_constraints(t, p, y, touching) if p.contacts else y, m
 
 

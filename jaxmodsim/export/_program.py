@@ -6,19 +6,16 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from .._core.compat import AVAILABLE, ClosedJaxpr, JaxprEqn, scan_counts
 from .._core.lu import is_constant
-from .._core.scalarise import AbstractScalars, AbstractSymbol, Params, Parts, Value, array_of, is_apart
+from .._core.scalarise import AbstractScalars, AbstractSymbol, Params, Parts, Value, array_of, known_array
 
 _COMPARISONS = {"eq", "ne", "lt", "le", "gt", "ge", "is_finite"}
 _FOLDS = {"reduce_max": jax.lax.max, "reduce_min": jax.lax.min, "reduce_prod": jax.lax.mul}
 _FOLDS |= {"reduce_and": jax.lax.bitwise_and, "reduce_or": jax.lax.bitwise_or}
 _ARGUMENTS = {"argmin": (jax.lax.lt, "lt"), "argmax": (jax.lax.gt, "gt")}
-# Operations that move entries to known positions.
-_INDEXED = {"gather", "scatter", "dynamic_slice", "dynamic_update_slice"}
 # Largest number of entries of an array in generated code.
 _MOST_ENTRIES = 10_000
 _FUNCTIONS = {"custom_jvp_call", "custom_vjp_call"}
@@ -187,7 +184,7 @@ class _StatementWriter(AbstractScalars):
         return out if exponent >= 0 else self.apply(jax.lax.div, "div", {}, [_one(x.dtype), out])
 
     def whole(self, eqn: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
-        """Loops, branches, calls, and operations that move entries to known positions."""
+        """Loops, branches, calls, slices at computed indices, and known results."""
         name, params = eqn.primitive.name, eqn.params
         if name in _FUNCTIONS:
             called = params["call_jaxpr"]
@@ -202,7 +199,7 @@ class _StatementWriter(AbstractScalars):
             return self.branch(params["branches"], inputs)
         kinds: list[Any] = [var.aval for var in eqn.invars]
         known = [
-            _known_array(x) if kind.size else np.asarray(np.zeros(kind.shape, kind.dtype))
+            known_array(x) if kind.size else np.asarray(np.zeros(kind.shape, kind.dtype))
             for kind, x in zip(kinds, inputs, strict=True)
         ]
         if all(x is not None for x in known):
@@ -217,10 +214,6 @@ class _StatementWriter(AbstractScalars):
             return [self.argument(*_ARGUMENTS[name], params, self.parts(inputs[0]))]
         if name == "dynamic_slice" and any(x is None for x in known[1:]):
             return [self.slice_at(params["slice_sizes"], self.parts(inputs[0]), inputs[1:])]
-        if name in _INDEXED and all(x is not None for x in known[1:2]):
-            return [self.move(eqn, inputs, known)]
-        if name == "scatter-add" and known[1] is not None:
-            return [self.scatter_add(eqn, self.parts(inputs[0]), self.parts(inputs[2]), known[1])]
         raise ValueError(f"{name} of arrays with {max(sizes)} entries" if max(sizes) > 1 else name)
 
     def divides(self, size: int) -> bool:
@@ -235,20 +228,6 @@ class _StatementWriter(AbstractScalars):
             return functools.reduce(lambda a, b: self.apply(compute, name, {}, [a, b]), x[(slice(None), *i)])
 
         return array_of(x.shape[1:], entry)
-
-    def move(self, eqn: JaxprEqn, inputs: list[Value], known: Sequence[np.ndarray | None]) -> Parts:
-        """The entries of the operands, rearranged as the operation rearranges their indices."""
-        entries: list[Any] = []
-        numbered: list[Any] = []
-        for x, places in zip(inputs, known, strict=True):
-            if places is not None and np.issubdtype(places.dtype, np.integer):
-                numbered.append(jnp.asarray(places))
-                continue
-            parts = self.parts(x)
-            numbered.append(jnp.arange(len(entries), len(entries) + parts.size).reshape(parts.shape))
-            entries += list(parts.flat)
-        places = np.asarray(eqn.primitive.bind(*numbered, **eqn.params))
-        return array_of(places.shape, lambda i: entries[places[i]])
 
     def choose(self, test: Parts, one: Parts, other: Parts) -> Parts:
         """`one` where `test`, which has the leading axes of both, is true, else `other`."""
@@ -281,17 +260,6 @@ class _StatementWriter(AbstractScalars):
                 beyond = self.apply(jax.lax.ge, "ge", {}, [at, at.dtype.type(k)])
                 x = self.choose(_scalar_array(beyond), slices[k], x)
         return x
-
-    def scatter_add(self, eqn: JaxprEqn, x: Parts, updates: Parts, places: np.ndarray) -> Parts:
-        """Entries of `updates` added to those of `x` at known places."""
-        out = x.copy()
-        for i in np.ndindex(*updates.shape):
-            one = np.zeros(updates.shape)
-            one[i] = 1.0
-            (at,) = np.nonzero(np.ravel(eqn.primitive.bind(np.zeros(x.shape), places, one, **eqn.params)))
-            for k in at:
-                out.flat[k] = self.add(out.flat[k], updates[i])
-        return out
 
     @contextmanager
     def inner_block(self) -> Iterator[Block]:
@@ -380,9 +348,6 @@ class _StatementWriter(AbstractScalars):
     def branch(self, branches: Sequence[ClosedJaxpr], inputs: list[Value]) -> list[Value]:
         """Arms, one of which is executed."""
         (index,) = self.parts(inputs[0]).flat
-        if is_constant(index):
-            chosen = branches[int(np.clip(int(index), 0, len(branches) - 1))]
-            return self.run(chosen.jaxpr, chosen.consts, inputs[1:])
         arms = []
         for each in branches:
             with self.inner_block() as block:
@@ -396,15 +361,6 @@ class _StatementWriter(AbstractScalars):
 def _symbols(like: np.ndarray, dtype: np.dtype | None = None) -> Parts:
     """New symbols with the types of these entries."""
     return array_of(like.shape, lambda i: Symbol(like[i].dtype if dtype is None else dtype))
-
-
-def _known_array(x: Value) -> np.ndarray | None:
-    """A constant array; None if any entry is not constant."""
-    if not isinstance(x, np.ndarray) or not is_apart(x):
-        return np.asarray(x)
-    if x.size == 0 or not all(map(is_constant, x.flat)):
-        return None
-    return np.asarray(x.tolist(), x.flat[0].dtype).reshape(x.shape)
 
 
 def _needed(block: Block, live: set[Symbol]) -> Block:

@@ -8,7 +8,6 @@ from jaxtyping import Array, Bool, Float
 
 from .._core.arrays import Scalar
 from .._core.scalarise import in_scalars
-from ..mechanics import Contact
 from ._dynamics import Dynamics, State, from_dynamics, vector_field
 from ._impact import impact
 from ._scene import Scene
@@ -83,11 +82,13 @@ def switch(
     rest: Scalar,
     dense: Bool[Array, ""],
     holds: bool,
+    rate: State | None,
     least: Scalar | float = 0.0,
 ) -> tuple[State, Float[Array, " modes"], Float[Array, " modes"]]:
     """State and modes after the guards that `fired`.
 
-    Struck contacts close without a rebound where events accumulate (`dense`), or if it rises by less than `least` [m].
+    Struck contacts close without a rebound where events accumulate (`dense`), or if it rises by less than `least` [m],
+    under the `rate` of the state in the mode before; None without contacts.
     Friction elements that fired where events accumulate stick regardless of their limits if chatter is held (`holds`),
     and keep their modes otherwise. A closed contact that would pull opens at once, so that its time has the derivative.
 
@@ -112,7 +113,8 @@ def switch(
 
     if not holds:
         slip_fired = slip_fired & ~dense
-    bounces = _bounces(t, y, scene, _join(slips, closed, sides), least)
+    assert rate is not None
+    bounces = _bounces(t, y, scene, closed, rate, least)
 
     def strike(t: Array, q: Array, qd: Array) -> tuple[Array, Array, Array]:
         return impact(t, q, qd, scene.bind_state(t, q, qd), closed, contact_fired, rest, bounces, dense)
@@ -130,24 +132,27 @@ def switch(
     return after, _join(slips, jnp.where(pulls, 0.0, closed), sides), _join(slips, closed, sides)
 
 
-def _bounces(t: Scalar, y: State, scene: Scene, mode: Array, least: Scalar | float) -> Bool[Array, " contacts"]:
+def _bounces(
+    t: Scalar, y: State, scene: Scene, closed: Float[Array, " contacts"], rate: State, least: Scalar | float
+) -> Bool[Array, " contacts"]:
     """Which contacts rebound: those that are closed already, and those whose rebound is resolved.
 
     After a rebound with the velocity w a gap that accelerates by a < 0 is at most `w^2/(2 |a|)` wide, and closes after
     `2 w/|a|`. Both are relative to the surface, which may move. If one rebound is not resolved, no later one is: to
     first order in w their impulses, and those of friction under them, are those of rest.
     """
-    held = jtu.tree_map(lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, (t, y, scene, mode))
+    held = jtu.tree_map(lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, (t, y, scene, rate))
     eps = float(jnp.finfo(y.q.dtype).eps)
     shortest = max(_LONG * eps**0.5, _RESOLVED_TIME * eps) * jnp.abs(held[0])
 
-    def look(contact: Contact, d: Dynamics) -> Bool[Array, ""]:
-        (t, q, qd), params = (d.t, d.y.q, d.y.qd), d.scene.params
-        w, a = jax.jvp(lambda t, q, qd: contact.rate(t, q, qd, params)[0], (t, q, qd), (jnp.ones_like(t), qd, d.qdd))
-        gap = jnp.maximum(_RESOLVED * contact.rounding(t, q, params), least)
-        w, pull = contact.coefficient * jnp.abs(w), jnp.maximum(-a, 0.0)
-        return (w * w >= 2.0 * gap * pull) & (2.0 * w >= shortest * pull)
+    def look(t: Array, y: State, rate: State) -> Bool[Array, " contacts"]:
+        params, resolved = held[2].bind_state(t, y.q, y.qd).params, []
+        for each in scene.contacts.values():
+            pace = lambda t, q, qd, each=each: each.rate(t, q, qd, params)[0]  # noqa: E731
+            w, a = jax.jvp(pace, (t, y.q, y.qd), (jnp.ones_like(t), y.qd, rate.qd))
+            gap = jnp.maximum(_RESOLVED * each.rounding(t, y.q, params), least)
+            w, pull = each.coefficient * jnp.abs(w), jnp.maximum(-a, 0.0)
+            resolved.append((w * w >= 2.0 * gap * pull) & (2.0 * w >= shortest * pull))
+        return jnp.stack(resolved)
 
-    contacts = tuple(scene.contacts.values())
-    resolved = from_dynamics(lambda d: jnp.stack([look(each, d) for each in contacts]), *held)
-    return resolved | (scene.split_modes(mode)[1] > 0)
+    return in_scalars(look, held[0], held[1], held[3], seed=y.q) | (closed > 0)

@@ -23,6 +23,7 @@ from ..scene import (
     scene_step,
     start,
     switch,
+    vector_field,
 )
 from ..solvers import EventState
 
@@ -87,6 +88,12 @@ class IntegratedSystem(NamedTuple):
         if not self.canonical:
             return y
         return y._replace(qd=velocity(scene.lagrangian, t, y.q, y.qd, scene.params))
+
+    def state_rate(self, t: Array, state: State, slope: PyTree, scene: Scene, mode: Array | None) -> State:
+        """The rate of a `State`, from the rate of the integrated state."""
+        if self.canonical:
+            return vector_field(t, state, scene, mode)
+        return slope.motion if isinstance(slope, AugmentedState) else slope
 
     def replace(self, t: Array, y: PyTree, state: State, scene: Scene) -> PyTree:
         """The integrated state with another `State`."""
@@ -199,8 +206,9 @@ class RunFunctions(eqx.Module):
     def reset(self, t: Array, s: EventState, scene: Scene, fired: Array) -> EventState:
         """State after changes of modes and impacts; the same state without them."""
         before = self.system.state(t, s.y, scene)
+        rate = self.system.state_rate(t, before, s.slope, scene, s.mode) if scene.contacts else None
         assert s.dense is not None
-        state, mode, touching = switch(t, before, scene, s.mode, fired, self.rest, s.dense, self.holds)
+        state, mode, touching = switch(t, before, scene, s.mode, fired, self.rest, s.dense, self.holds, rate)
         after = self.system.replace(t, s.y, state, scene)
         if scene.contacts:  # a contact may have closed; the derivative, too, or the next step would move it
             after = self.project(t, after, scene, touching)

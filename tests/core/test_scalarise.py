@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxmodsim._core import scalarise
 from jaxmodsim._core.arrays import opaque_one
 from jaxmodsim._core.scalarise import columns_of, in_scalars
 
@@ -49,6 +50,19 @@ FUNCTIONS: dict[str, Callable[[Any], Any]] = {
     "split": lambda x: jnp.split(jnp.outer(x, x), [1], axis=1)[1],
     "unstacked": lambda x: jnp.unstack(jnp.outer(x, x), axis=1)[2] * jnp.unstack(x)[0],
     "entries": lambda x: x[jnp.array([2, 0, 2])],
+    "rows and columns": lambda x: jnp.outer(x, x)[jnp.array([2, 0])][:, np.array([-1, 0, 1])],
+    "single entries": lambda x: jnp.outer(x, x)[jnp.array([2, 0]), jnp.array([1, 1])],
+    "windows": lambda x: jax.vmap(lambda i: jax.lax.dynamic_slice(x, (i,), (2,)))(jnp.array([1, 0, 9])),
+    "entries by vmap": lambda x: jax.vmap(lambda row, i: row[i])(jnp.outer(x, x), jnp.array([2, 0, 1])),
+    "out of range": lambda x: jnp.nan_to_num(x.at[jnp.array([5, 1])].get(mode="fill")) + x[jnp.array([7, 1])],
+    "mask": lambda x: x[np.array([True, False, True])],
+    "taken": lambda x: (
+        jnp.take(jnp.outer(x, x), jnp.array([0, 2]), axis=1) + jnp.take_along_axis(x, jnp.array([2, 0, 1]), 0)[:, None]
+    ),
+    "diagonal": lambda x: jnp.diagonal(jnp.outer(x, x)) + jnp.trace(TABLE * x[0]),
+    "set at indices": lambda x: (TABLE * x[0]).at[np.ix_([0, 2], [1, 2])].set(jnp.outer(x[:2], x[1:])),
+    "added at indices": lambda x: jnp.zeros(3).at[jnp.array([2, 0, 2])].add(x).at[jnp.array([8, 1])].add(x[1:]),
+    "updated": lambda x: jax.lax.dynamic_update_slice(jnp.outer(x, x), jnp.outer(x[:2], x[:2]), (1, 7)),
     "set": lambda x: (TABLE * x[0]).at[1].set(x).at[0, 0].add(x[1]),
     "choices": lambda x: jnp.where(x > 0.5, jnp.sqrt(jnp.abs(x)), jnp.where(jnp.eye(3) == 1, x, 2.0)),
     "bounds": lambda x: jnp.clip(x, 0.3, 0.6) + jnp.maximum(x, 0.5) - jnp.max(x) + jnp.round(3.0 * x),
@@ -59,6 +73,7 @@ FUNCTIONS: dict[str, Callable[[Any], Any]] = {
     "solved": lambda x: jnp.linalg.solve(TABLE + jnp.diag(3.0 + x), x),
     "looked up": lambda x: jnp.interp(x, jnp.linspace(-1.0, 1.0, 9), jnp.linspace(-1.0, 1.0, 9) ** 3),
     "loop": _last,
+    "known condition": lambda x: jax.lax.cond(jnp.array(True), jnp.sin, jnp.cos, x),
     "condition": lambda x: jax.lax.cond(x[0] > 0, jnp.sin, jnp.cos, x),
     "own derivative": lambda x: _cubed(jnp.outer(x, x)),
     "inner jit": lambda x: jax.jit(lambda y: jnp.tanh(y) @ TABLE)(x) + x,
@@ -150,6 +165,27 @@ def test_large_functions_and_single_numbers_stay_as_they_are() -> None:
 
     for fn, x in ((long, jnp.linspace(0.0, 1.0, 100)), (lambda x: jnp.sin(x[0]), X[:1])):
         assert primitives(partial(in_scalars, fn, seed=x), x) == primitives(fn, x)
+
+
+@pytest.mark.parametrize("most", [1, scalarise.MAX_SCALARS])
+def test_known_indices_are_slices_in_functions_of_any_size(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No gather, whose derivative is a scatter, which a kernel cannot hold."""
+    monkeypatch.setattr(scalarise, "MAX_SCALARS", most)
+    for name in ("rows and columns", "single entries", "mask", "taken", "diagonal", "set at indices"):
+
+        def slope(x: Any, fn: Callable[[Any], Any] = FUNCTIONS[name]) -> Any:
+            return jax.grad(lambda x: jnp.sum(fn(x) ** 2))(x)
+
+        with jax.numpy_rank_promotion("allow"):
+            assert not {"gather", "scatter", "scatter-add"} & set(primitives(scalar(slope), X)), name
+            np.testing.assert_allclose(jax.jit(scalar(slope))(X), slope(X), rtol=1e-12)
+
+
+def test_a_function_of_entries() -> None:
+    """JAX has no derivative of it."""
+    np.testing.assert_array_equal(
+        jax.jit(scalar(lambda x: x.at[jnp.array([2, 0])].apply(jnp.abs)))(-X), [0.3, 0.7, 0.9]
+    )
 
 
 def test_large_arrays_stay_whole() -> None:

@@ -76,8 +76,8 @@ def _guards(t: Array, y: State, scene: Scene, mode: Array) -> Float[Array, " mod
 
 
 _field = jax.jit(vector_field)
-# Events of a record that is replayed do not accumulate.
-_switch = jax.jit(lambda *instant: switch(*instant, dense=jnp.zeros((), bool), holds=False)[:2])
+# Events of a record that is replayed do not accumulate, and its scene has no contacts.
+_switch = jax.jit(lambda *instant: switch(*instant, dense=jnp.zeros((), bool), holds=False, rate=None)[:2])
 
 
 def first_modes(t: Array, y: State, scene: Scene) -> tuple[State, Float[Array, " modes"]]:

@@ -128,7 +128,7 @@ class EventSolver(AbstractSolverWrapper):
       times in between have the state after the event. If that value is less than the error, the guard may also fire
       before it, within the resolution of time.
     - `reset`: `reset(t, s, args, fired)` -> `s` with another `y` or `mode` (by `s._replace`); `fired` are booleans,
-      shape `[guards]`.
+      shape `[guards]`. There `s.slope` is the rate of `s.y` in the mode before the event, a constant.
     - `carries_on`: whether the run goes on where events accumulate, for all guards or one flag for each.
     - `project`: `project(t, s, args)` -> `s`, applied after every step, for invariants that drift.
     - `enforce`: whether the guards are conditions that have to hold, instead of crossings.
@@ -395,11 +395,13 @@ class EventSolver(AbstractSolverWrapper):
         next_end = self._policy.next_end(ahead, missed, (landing(ahead)[coming], divisor))
         return Landing(fired, first, order, missed, landed, landed, next_end, jnp.sum(jnp.where(first, near, 0.0)))
 
-    def _guard_rates(self, t: Array, state: EventState, slope: PyTree, args: PyTree) -> Float[Array, " guards"]:
-        """Rates of the guards along the motion; constant."""
-        t, state, slope, args = _held((t, state, slope, args))
-        along = jnp.ones_like(t), slope
-        return jax.jvp(lambda t, y: self._guards(t, state._replace(y=y), args), (t, state.y), along)[1]
+    def _rates(
+        self, evaluate: Callable[..., PyTree], t: Array, y: PyTree, mode: PyTree, args: PyTree
+    ) -> tuple[PyTree, Float[Array, " guards"]]:
+        """The rate of y, and the rates of the guards along it, from one evaluation of both; constant."""
+        t, y, mode, args = _held((t, y, mode, args))
+        (slope, _), along = jax.linearize(lambda t, y: evaluate(t, y, mode, args), t, y)
+        return _held((slope, along(jnp.ones_like(t), slope)[1]))
 
     def _jump(
         self,
@@ -428,13 +430,13 @@ class EventSolver(AbstractSolverWrapper):
         def way(y: PyTree, mode: PyTree, first: Array, fires: Array) -> tuple[Passage, PyTree, tuple[Array, Array]]:
             """Through the event of the guards `fires`; with the rates of y and of the first guard, and `early`."""
             here = state._replace(y=y, mode=mode)
-            slope = terms.vf(*_held((t, here, args))).y
-            rate = jnp.sum(jnp.where(first, self._guard_rates(t, here, slope, args), 0.0))
+            slope, rates = self._rates(evaluate, t, y, mode, args)
+            rate = jnp.sum(jnp.where(first, rates, 0.0))
             rate = jnp.where(rate == 0, 1.0, rate)
 
             def reset(t_event: Array, y: PyTree) -> tuple[PyTree, PyTree]:
                 dense = _spread(t_event, state.t, memory)[1] & jnp.any(fires & carries)
-                after = self.reset(t_event, here._replace(y=y, dense=dense), whole, fires)
+                after = self.reset(t_event, here._replace(y=y, dense=dense, slope=slope), whole, fires)
                 return after.y, after.mode
 
             # The event of a guard that arrives is at its value `root`, that of others at zero, `early` later.
@@ -460,7 +462,7 @@ class EventSolver(AbstractSolverWrapper):
         clear = _constant(values) > jnp.where(fired, LATITUDE * jnp.abs(rate) * near, 0.0)
 
         def rises() -> Bool[Array, " guards"]:
-            return self._guard_rates(t_event, state._replace(y=y, mode=mode), slope, new_args) > 0
+            return self._rates(evaluate, t_event, y, mode, new_args)[1] > 0
 
         armed = self._policy.armed_after(clear, fired, memory.armed, rises)
         if carries.any():

@@ -53,6 +53,7 @@ class EventState(NamedTuple):
     - `log`: an `EventLog`, or None.
     - `report`: the report of the last step to the controller.
     - `dense`: in a call of `reset`, whether events accumulate and the run carries on; None elsewhere.
+    - `slope`: in a call of `reset`, the rate of y in this mode, constant; None elsewhere.
     """
 
     y: PyTree
@@ -64,6 +65,7 @@ class EventState(NamedTuple):
     log: EventLog | None
     report: StepReport
     dense: Bool[Array, ""] | None = None
+    slope: PyTree = None
 
     def rate(self, dy: PyTree) -> "EventState":
         """The value of a vector field: `dy` for `y`, and zero for everything else, which is constant in a step."""
