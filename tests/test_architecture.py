@@ -21,7 +21,7 @@ FILES = sorted(ROOT.rglob("*.py"))
 # never in the wheel. Rooms are in the order of their imports: a room imports only rooms above it, imports for type
 # checkers included; what it takes from another room is among that room's public names. `_core` has none: all of it is
 # private to the package. The number is the budget of lines of a room: to raise it is a decision, whose commit says why.
-CORE = {"_core": 3480, "mechanics": 1598, "friction": 3020, "scene": 4083, "solvers": 4179, "simulation": 3248}
+CORE = {"_core": 3488, "mechanics": 1600, "friction": 3020, "scene": 4083, "solvers": 4179, "simulation": 3248}
 APPLICATIONS = {
     "metrics": 633,
     "analysis": 2136,

@@ -11,7 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmodsim import Contact, Coulomb, Friction, Scene, simulate
+from jaxmodsim import (
+    AppliedForce,
+    Constraint,
+    Contact,
+    Coulomb,
+    Friction,
+    Scene,
+    VelocityConstraint,
+    simulate,
+)
 from jaxmodsim.problems import named_problems
 
 from .hard.case import SceneTask
@@ -61,19 +70,33 @@ def test_run_and_derivatives_are_one_kernel_each(name: str, read: Callable[[str]
     assert (found != KERNELS) == (name in NOT_ONE_KERNEL), found
 
 
-def test_indices_in_a_lagrangian_and_two_contacts_with_friction() -> None:
-    """The derivative of `x[indices]` was a scatter, which no kernel holds, as was that of the loads of friction."""
-    bodies, ends = np.array([0, 2]), (-0.5, 0.5)
+BODIES = np.array([0, 2])
+ENDS = [Contact(lambda t, q, p, x=x: q[1] + x * jnp.sin(q[BODIES])[1], name=f"end {x}") for x in (-0.5, 0.5)]
+INDEXED: dict[str, dict[str, list[Any]]] = {
+    "the Lagrangian": {},
+    "a force": {"effects": [AppliedForce(lambda t, q, qd, p: jnp.zeros(3).at[BODIES].set(-qd[BODIES]))]},
+    "slip in the plane": {"effects": [Friction(Coulomb(0.5), along=lambda q: q[BODIES], normal_force=1.0)]},
+    "a constraint": {"constraints": [Constraint(lambda t, q, p: q[BODIES] - 0.2 * q[1], name="ramps")]},
+    "a velocity constraint": {
+        "constraints": [VelocityConstraint(lambda t, q, qd, p: jnp.diff(qd[BODIES]), name="edge")]
+    },
+    "two contacts with friction": {
+        "effects": [Friction(Coulomb(0.3), along=lambda q: q[0], normal_force=each.name) for each in ENDS],
+        "constraints": [*ENDS],
+    },
+}
+
+
+@pytest.mark.parametrize("kind", INDEXED)
+def test_entries_by_lists_of_indices_are_in_one_kernel(kind: str) -> None:
+    """In arrays their derivative is a scatter, which no kernel holds. That of the loads of friction was one, too."""
 
     def lagrangian(t: Any, q: Any, qd: Any, p: Any) -> Any:
         del t
-        return 0.5 * p["m"] * (jnp.sum(qd[bodies] ** 2) + qd[1] ** 2) - p["m"] * 9.81 * jnp.take(q, jnp.array([1]))[0]
-
-    contacts = [Contact(lambda t, q, p, x=x: q[1] + x * jnp.sin(q[2]), name=f"end {x}") for x in ends]
-    rubbing = [Friction(Coulomb(0.3), along=lambda q: q[0], normal_force=each.name) for each in contacts]
+        return 0.5 * p["m"] * (jnp.sum(qd[BODIES] ** 2) + qd[1] ** 2) - p["m"] * 9.81 * jnp.take(q, jnp.array([1]))[0]
 
     def last(m: Any) -> Any:
-        scene = Scene(lagrangian, {"m": m}, effects=rubbing, constraints=contacts)
-        return simulate(scene, np.array([0.0, 0.5, 0.1]), np.zeros(3), 0.5, throw=False).q[-1, 0]
+        scene = Scene(lagrangian, {"m": m}, **INDEXED[kind])
+        return simulate(scene, np.zeros(3), np.zeros(3), 0.5, throw=False).q[-1, 0]
 
     assert kernels(last, jnp.asarray(1.0)) == KERNELS

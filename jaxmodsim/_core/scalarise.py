@@ -55,7 +55,7 @@ Value: TypeAlias = Array | np.ndarray | np.generic | AbstractSymbol
 Params: TypeAlias = dict[str, Any]  # as JAX has them
 
 
-def in_scalars(fn: Callable[..., PyTree], *args: PyTree, seed: Float[Array, "..."]) -> PyTree:
+def in_scalars(fn: Callable[..., PyTree], *args: PyTree, seed: Float[Array, "..."] | None) -> PyTree:
     """Evaluate `fn(*args)` with scalars in place of small arrays.
 
     XLA on CPU fuses operations on arrays of two to eight entries badly, and recomputes shared terms. From scalars it
@@ -68,9 +68,10 @@ def in_scalars(fn: Callable[..., PyTree], *args: PyTree, seed: Float[Array, "...
 
     - `fn`: a function that JAX can trace. The result is that of the plain call outside `jax.jit` and similar
       transformations, and if all values are scalars. If they have more than `MAX_SCALARS` entries in total, `fn` is
-      evaluated in arrays, and only indices that are known become slices.
+      evaluated in arrays: only entries by known indices become slices, as their derivatives do not fit into a kernel.
     - `args`: pytrees of arrays and numbers.
-    - `seed`: numbers that are unknown while compiling. If the first is not finite, the result may not be finite.
+    - `seed`: numbers that are unknown while compiling. If the first is not finite, the result may not be finite. None
+      for an evaluation in arrays.
 
     **Returns:**
 
@@ -81,12 +82,12 @@ def in_scalars(fn: Callable[..., PyTree], *args: PyTree, seed: Float[Array, "...
     closed, shapes = trace_in_arrays(fn, *args)
     leaves = [x if hasattr(x, "shape") else jnp.asarray(x) for x in jtu.tree_leaves(args)]
     sizes = [size for size in sizes_of(closed.jaxpr) if size <= MAX_ENTRIES]
-    if is_known(*leaves):
+    seed = seed if sum(sizes) <= MAX_SCALARS else None
+    if is_known(*leaves) or (seed is None and not _has_indices(closed.jaxpr)):
         return fn(*args)
     if max(sizes, default=0) > 1:
-        divided = sum(sizes) <= MAX_SCALARS
-        scalars = _Scalars(opaque_one(jax.lax.stop_gradient(jnp.ravel(seed)[0])) if divided else None)
-        out = [jnp.asarray(_whole(x)) for x in scalars.run(closed.jaxpr, closed.consts, leaves)]
+        unit = None if seed is None else opaque_one(jax.lax.stop_gradient(jnp.ravel(seed)[0]))
+        out = [jnp.asarray(_whole(x)) for x in _Scalars(unit).run(closed.jaxpr, closed.consts, leaves)]
     else:
         out = jaxpr_as_fun(closed)(*leaves)
     return jtu.tree_unflatten(jtu.tree_structure(shapes), out)
@@ -142,6 +143,13 @@ def sizes_of(jaxpr: Any) -> list[int]:
     inner = [eqn.params["jaxpr"].jaxpr for eqn in jaxpr.eqns if eqn.primitive.name in _CALLS]
     own = [var.aval.size for eqn in jaxpr.eqns for var in eqn.outvars]
     return own + [size for each in inner for size in sizes_of(each)]
+
+
+def _has_indices(jaxpr: Jaxpr) -> bool:
+    """Whether a traced function reads or writes entries by an array of indices, or may do so on some platform."""
+    inner = [eqn.params["jaxpr"].jaxpr for eqn in jaxpr.eqns if eqn.primitive.name in _CALLS]
+    own = any(eqn.primitive.name in (*_INDEXED, "platform_index") for eqn in jaxpr.eqns)
+    return own or any(map(_has_indices, inner))
 
 
 def _entries(shape: tuple[int, ...]) -> Iterator[tuple[int, ...]]:

@@ -24,6 +24,7 @@ from .._core.functions import as_function, result_shape
 from .._core.parameters import AbstractRanged, Number, parameter
 from .._core.position import PositionFn, as_optional_position_fn
 from .._core.safe import safe_norm
+from .._core.scalarise import in_scalars
 from .._core.trace_checks import traced
 
 
@@ -81,7 +82,8 @@ class AbstractPositionConstraint(AbstractConstraint):
 
     def error(self, t: Scalar, q: PerDof, params: PyTree) -> Float[Array, " m"]:
         """Residual at the coordinates, shape `[m]`."""
-        return self._values(t, q if self.at is None else self.at(q, params), params)
+        where = lambda q: q if self.at is None else self.at(q, params)  # noqa: E731
+        return in_scalars(lambda t, q: self._values(t, where(q), params), t, q, seed=None)
 
     def _values(self, t: Scalar, x: Float[Array, "..."], params: PyTree) -> Float[Array, " m"]:
         return jnp.ravel(jnp.asarray(self.value(t, x, params), x.dtype))
@@ -210,7 +212,8 @@ class VelocityConstraint(AbstractConstraint):
 
     def rate(self, t: Scalar, q: PerDof, qd: PerDof, params: PyTree) -> Float[Array, " m"]:
         """The value of psi, shape `[m]`."""
-        return jnp.ravel(jnp.asarray(self.psi(t, q, qd, params), q.dtype))
+        psi = lambda t, q, qd: jnp.ravel(jnp.asarray(self.psi(t, q, qd, params), q.dtype))  # noqa: E731
+        return in_scalars(psi, t, q, qd, seed=None)
 
     def check(self, q: PerDof, qd: PerDof, params: PyTree, name: str) -> None:
         """Check that psi is a number or a vector."""
